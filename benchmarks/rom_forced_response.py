@@ -39,7 +39,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
 import snrmjax as sj
-from snrmjax.condense.elements.strain_energy import shape_rows, uniform_load
+from snrmjax.condense.elements.strain_energy import interpolation, uniform_load
 
 tell = teller(__file__)
 
@@ -94,7 +94,7 @@ def full_model(beam: sj.condense.Beam, kind: str) -> FullModel:
     ratio = _RATIO * (first / frequency if kind == "mass" else frequency / first)
     weighted = mass @ shapes
     damping = weighted * (2 * ratio * frequency) @ weighted.T
-    load, middle = (np.asarray(row)[free] for row in (uniform_load(beam), shape_rows(beam, 0.5)[1]))
+    load, middle = (np.asarray(row)[free] for row in (uniform_load(beam), interpolation(beam, 0.5)[1]))
     return FullModel(beam, damping, frequency, ratio, load, middle)
 
 

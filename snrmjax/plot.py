@@ -1,4 +1,4 @@
-"""Figures of what was measured, identified, simulated and diagnosed."""
+"""Figures of measured, identified, simulated and diagnosed results."""
 
 from snrmjax.report import style
 from snrmjax.report.figures.diagnosis import (

@@ -110,7 +110,7 @@ def columns(path: Path) -> list[str]:
         return next(csv.reader(file))
 
 
-def test_identify_writes_what_the_contract_says(files, tmp_path):
+def test_identify_writes_the_files_of_the_contract(files, tmp_path):
     model, data = files
     out = tmp_path / "out"
     done = run(
@@ -160,7 +160,7 @@ def test_identify_writes_what_the_contract_says(files, tmp_path):
     assert "resonance at 1e-05 N: 64.78 Hz, " in done.stderr
 
 
-def test_simulate_and_nnm_write_what_the_contract_says(files, tmp_path):
+def test_simulate_and_nnm_write_the_files_of_the_contract(files, tmp_path):
     model, _ = files
     out = tmp_path / "out"
     done = run(
@@ -297,11 +297,11 @@ def test_diagnose_writes_the_verdict_the_model_and_the_report(tmp_path):
     table, model = (str(blind.with_suffix(suffix)) for suffix in (".csv", ".toml"))
     done = run("diagnose", table, "--model", model, "--out", out)
     assert done.code == 0
-    told = json.loads((out / "diagnosis.json").read_text())
-    assert told["verdict"] == "none"
-    assert told["effects"] == told["candidates"] == []
-    assert told["decide_by"] is None
-    assert set(told["gap"]) >= {
+    answer = json.loads((out / "diagnosis.json").read_text())
+    assert answer["verdict"] == "none"
+    assert answer["effects"] == answer["candidates"] == []
+    assert answer["decide_by"] is None
+    assert set(answer["gap"]) >= {
         "before",
         "after",
         "held_out_before",
@@ -312,7 +312,7 @@ def test_diagnose_writes_the_verdict_the_model_and_the_report(tmp_path):
     assert (out / "report.html").stat().st_size > 1000
     assert list(out.glob("*.png"))
     assert "blind_03.csv: none\n" in done.stderr
-    assert "Nothing is missing that these data could show" in done.stderr
+    assert "No missing effect is detected in these data" in done.stderr
 
 
 def test_diagnose_refuses_too_few_states(files, tmp_path):
@@ -403,7 +403,7 @@ def test_an_option_without_effect_is_refused(files, tmp_path, options, named):
 
 
 def test_every_option_of_identify_is_joined_to_the_others_or_tried_here(files, tmp_path):
-    """A new option must be said to belong to one way of identifying, or to both."""
+    """A new option must be assigned to one way of identification, or to both."""
     command = typer.main.get_command(app).commands["identify"]
     both = {"data", "model", "out", "predict_force", "predict_drive", "extrapolate", "help_all"}
     both |= {"axis", "day_std", "self_excited", "predict_at", "modes", "effects"}
@@ -464,7 +464,7 @@ def rows(path: Path) -> dict[str, np.ndarray]:
     return {name: np.array([float(row[name]) for row in table]) for name in names}
 
 
-def test_a_joint_fit_writes_what_the_contract_says(fitted):
+def test_a_joint_fit_writes_the_files_of_the_contract(fitted):
     out, _ = fitted
     assert columns(out / "next.csv") == [
         "rank",
@@ -512,7 +512,7 @@ def test_each_table_of_a_joint_fit_is_written_once(fitted):
     assert sorted(written) == ["backbone.csv", "next.csv", "points.csv", "prediction.csv"]
 
 
-def test_a_prediction_says_where_a_further_level_would_be(fitted):
+def test_a_prediction_gives_the_resonance_of_a_new_level(fitted):
     out, _ = fitted
     summary = json.loads((out / "summary.json").read_text())
     for tip, one in zip(summary["resonances"], summary["resonance_distributions"], strict=True):
@@ -563,20 +563,20 @@ def test_notes_on_single_states_reach_the_reader_of_a_joint_fit(files, tmp_path)
     # Far above resonance a degree of phase makes damping negative: that state has no point.
     level, *others = linear_row(2, 2e-5, 100.0).split(",")
     omega, force, real, imaginary = map(float, others)
-    turned = complex(complex(real, imaginary) * np.exp(-0.2j))
-    data.write_text(HEADER + ROWS + f"{level},{omega},{force},{turned.real!r},{turned.imag!r}\n")
+    rotated = complex(complex(real, imaginary) * np.exp(-0.2j))
+    data.write_text(HEADER + ROWS + f"{level},{omega},{force},{rotated.real!r},{rotated.imag!r}\n")
     out = tmp_path / "out"
     done = run("identify", data, "--model", model, "--out", out, "--fit", "polynomial:1,constant")
     assert done.code == 0, done.stderr
-    told = json.loads((out / "summary.json").read_text())["notes"]
-    for text in (done.stderr, " ".join(told), (out / "report.html").read_text()):
-        assert "1 of 11 steady states have no point of their own" in text
+    notes = json.loads((out / "summary.json").read_text())["notes"]
+    for text in (done.stderr, " ".join(notes), (out / "report.html").read_text()):
+        assert "1 of 11 steady states give no point of their own" in text
 
 
 @pytest.mark.long
 def test_a_fit_without_a_state_to_advise_is_written_all_the_same(files, tmp_path):
     model, data = files
-    # 80° from resonance on either side: what lies nearer has amplitudes that nobody measured.
+    # 80° from resonance on either side: closer states have amplitudes beyond the measured ones.
     data.write_text(
         HEADER
         + "".join(
@@ -636,15 +636,15 @@ def test_with_a_drive_voltage_predictions_and_advice_are_in_volts(beam, tmp_path
 
 
 @pytest.mark.long
-def test_predictions_go_as_far_as_asked(files, tmp_path):
+def test_predictions_extend_as_far_as_requested(files, tmp_path):
     model, data = files
     command = ("identify", data, "--model", model, "--out", tmp_path)
-    asked = ("--predict-force", "8e-5")  # four times the largest: so is a linear resonance
-    done = run(*command, *asked)
+    options = ("--predict-force", "8e-5")  # four times the largest, like a linear resonance
+    done = run(*command, *options)
     assert done.code == 0, done.stderr
     assert json.loads((tmp_path / "summary.json").read_text())["resonances"] == []
     assert "--extrapolate" in done.stderr
-    done = run(*command, *asked, "--extrapolate", "5")
+    done = run(*command, *options, "--extrapolate", "5")
     (one,) = json.loads((tmp_path / "summary.json").read_text())["resonances"]
     assert one["frequency_hz"] == pytest.approx(64.78, rel=1e-6)
     assert one["beyond_the_data"]
@@ -693,7 +693,7 @@ def test_conjugated_phases_are_named_in_a_note(files, tmp_path, command):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (lambda re, im: (-re, -im), "turn the phases by 180°"),
+        (lambda re, im: (-re, -im), "shift the phases by 180°"),
         (lambda re, im: (im / 402, -re / 402), "displacements seem to be given as velocities"),
     ],
 )

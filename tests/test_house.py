@@ -105,7 +105,7 @@ SUB_ROOMS = {
     "io.programs": {"io.files"},
     "model.builders": {
         *("model.moving_base", "model.effect_base", "model.effects", "model.modes"),
-        *("model.places", "model.potential", "model.structures"),
+        *("model.attachment", "model.potential", "model.structures"),
     },
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),

@@ -58,4 +58,4 @@ def test_examples_run_and_say_what_they_promise(own_files, capsys):
     assert names["answer"].verdict == "none"
     assert "root_damping.coefficient" in names["answer"].detection_limits
     assert "Identification: " in told
-    assert "Nothing is missing" in told
+    assert "No missing effect" in told

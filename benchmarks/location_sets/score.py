@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.model.modes import Beside
+from snrmjax.model.modes import OptionalModalData
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from harness import options, teller
@@ -42,7 +42,7 @@ def of_one_sensor(data, model):
         *(model.modes.natural_frequency, model.modes.damping_ratio),
         *(np.asarray(model.modes.mode_shape)[[k]], model.modes.participation),
         sensors=(data.sensors[k],),
-        beside=Beside({name: model.modes.shape_at(name) for name in others}),
+        beside=OptionalModalData({name: model.modes.shape_at(name) for name in others}),
     )
     given = (data.level, data.frequency, data.force, seen.pop("velocity"))
     alone = sj.measure.steady_states(

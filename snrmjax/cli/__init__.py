@@ -1,6 +1,6 @@
 """The commands, in the order in which a test needs them.
 
-Each imports what it needs by itself: none waits for the imports of another.
+Each imports its own dependencies, so that none waits for the imports of another.
 """
 
 import gc
@@ -12,7 +12,7 @@ import typer
 
 from snrmjax.cli.check_command import check
 from snrmjax.cli.compare_command import compare
-from snrmjax.cli.console import read_more, refuse, say, supervised
+from snrmjax.cli.console import print_line, read_more, refuse, supervised
 from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
@@ -33,7 +33,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-# The first of each runs in the tests, on files that they make.
+# The first example of each runs in the tests.
 _EXAMPLES: dict[Callable[..., None], tuple[str, ...]] = {
     demo: ("snrmjax demo --out demo",),
     whole_test: ("snrmjax test measurements --out report",),
@@ -76,9 +76,9 @@ _EXAMPLES: dict[Callable[..., None], tuple[str, ...]] = {
         "snrmjax rom --calculix deck.inp --modes 1,3,5 --out reduced",
     ),
 }
-_OBJECTS = 100_000  # made between two collections of rubbish, some 10 MB
+_OBJECTS = 100_000  # allocated between two garbage collections, some 10 MB
 _READ_MODELS = (whole_test, check, identify, compare, diagnose, simulate, nnm)
-# What Python has another use for, or pytest.
+# Names reserved by Python or pytest.
 _NAMES = {whole_test: "test", import_: "import"}
 
 
@@ -93,10 +93,10 @@ app.add_typer(study_app)
 
 def main() -> None:
     """Run the commands; wrong input ends with exit code 2 and one sentence."""
-    # Imports and programs stay to the end: to look for rubbish in them takes a tenth of a command.
+    # Imports and programs live to the end: garbage collection would take a tenth of the run time.
     gc.set_threshold(_OBJECTS)
-    # Whole responses take a graphics processor many times as long as a CPU's core, and every
-    # process would take most of its memory (the site's validation page on other programs).
+    # Responses are many times slower on a GPU than on a CPU core, and every process would allocate
+    # most of its memory (the site's validation page on other programs).
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     asks_help = not {"--help", "--help-all"}.isdisjoint(sys.argv)
     if sys.argv[1:] and not asks_help:  # help does not wait for the import of JAX
@@ -110,5 +110,5 @@ def main() -> None:
         refuse(str(error))
         more = read_more(error)
         if more:
-            say(more)
+            print_line(more)
         sys.exit(2)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from snrmjax.cli.console import say, tell
+from snrmjax.cli.console import print_line, print_result
 from snrmjax.cli.options import FILES, Out
 from snrmjax.report.writing import staged
 
@@ -24,7 +24,7 @@ def check(
     model: Annotated[
         Path | None,
         typer.Option(
-            help="Linear model of the structure (TOML); without it scales are not looked at.",
+            help="Linear model of the structure (TOML); without it scales are not checked.",
             metavar="MODEL",
             rich_help_panel=FILES,
             show_default=False,
@@ -44,20 +44,19 @@ def check(
 
     Conjugated responses, accelerations or displacements for velocities, volts for newtons, rms for
     peak, degrees for radians, clipped channels, unsettled steps, drop-out and harmonics of the
-    force, drift, files of different structures, shapes of another scale, folded frequencies; each
-    with its evidence and what mends it, as an import where it can. Nothing is said where all
-    is well.
+    force, drift, files of different structures, shapes of another scale, aliased frequencies; each
+    with its evidence and correction, as an import command where possible.
 
-    What scales force and response alike cannot be seen: rms for peak in both, or one wrong range
-    for both, leaves their ratio right and moves all amplitudes.
+    A common scale error of force and response cannot be detected: rms for peak in both, or one
+    wrong range for both, keeps their ratio and changes all amplitudes.
 
-    Writes check.json, a list that is empty when all is well; the exit code is 0 either way.
+    Writes check.json, a list that is empty without findings; the exit code is 0 either way.
     """
     from snrmjax.pipelines.check import check_files
     from snrmjax.report.pages import checkup
 
     with staged(out) as folder:
-        found = check_files(data, model, record or ())
-        checkup.write(folder, found)
-    tell(found)
-    say(f"written to {out / 'check.json'}")
+        result = check_files(data, model, record or ())
+        checkup.write(folder, result)
+    print_result(result)
+    print_line(f"written to {out / 'check.json'}")

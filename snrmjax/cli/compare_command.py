@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from snrmjax.cli.console import tell, written
+from snrmjax.cli.console import print_result, written
 from snrmjax.cli.options import Linear, Out, completion
 from snrmjax.report.writing import staged
 
@@ -39,15 +39,15 @@ def compare(
         ),
     ] = None,
 ) -> None:
-    """Run other methods beside the inverse SNRM on the same data.
+    """Run other methods in addition to the inverse SNRM on the same data.
 
-    A time record is sorted by what it is: free decay, stepped sine, slow sweep or broadband; the
+    A time record is classified as free decay, stepped sine, slow sweep or broadband; the
     rule that decided is printed. Stepped sines and sweeps become steady states. A record's CSV has
     time_s, force_n or drive_v (neither for a free decay) and velocity_m_s, acceleration_m_s2 or
     displacement_m (of several sensors tip.velocity_m_s, …).
 
     A method that the data do not allow is named with the reason, and the others still run. The
-    repository's benchmarks/methods_sources.py holds them against their sources.
+    repository's benchmarks/methods_sources.py compares them with their sources.
 
     Writes compare.csv, summary.json, compare.png and report.html.
     """
@@ -60,8 +60,8 @@ def compare(
     with staged(out) as folder:
         structure = read_model(model)
         tests = [test for path in data for test in read_measured_test(path, structure)]
-        found = compare_methods(tests, modes_of(structure), tuple(method) if method else None)
+        result = compare_methods(tests, modes_of(structure), tuple(method) if method else None)
         title = ", ".join(path.stem.replace("_", " ") for path in data)
-        comparison.write(folder, found, title=title, model=structure.name)
-    tell(found, comparison.notes_of(found))
+        comparison.write(folder, result, title=title, model=structure.name)
+    print_result(result, comparison.notes_of(result))
     written(out)

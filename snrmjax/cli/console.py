@@ -1,4 +1,4 @@
-"""What the commands say on standard error, and how they end."""
+"""Messages of the commands on standard error, and their exit codes."""
 
 import logging
 import os
@@ -21,7 +21,7 @@ _FORMATS, _IMPORT = ("File formats", "formats"), ("Import a laboratory's files",
 _ELEMENT = ("Place an element at a point", "how-to/element")
 _OWN = ("Add an effect of your own", "how-to/own-effect")
 _REDUCED = ("Make a reduced model", "how-to/reduced-model")
-# By the part of the package that refused an input, where a page helps: title and path.
+# Helpful page (title and path) by the part of the package that refused an input.
 PAGES = {
     "io.files": None,  # no such file, or no text
     "io.tables.check_driven_alike": ("Use a shaker table", "how-to/shaker-table"),
@@ -44,32 +44,32 @@ PAGES = {
 }
 
 INTERRUPTED = 130  # the exit code of a process that ended on Ctrl-C, as shells have it
-_PATIENCE = 0.5  # s after Ctrl-C in which a command may end by itself
+_PATIENCE = 0.5  # s after Ctrl-C for a command to end by itself
 _STILL = 30.0  # s after which the same stage is reported again
-_QUIET = 5.0  # s of work before the first line, and at least between two lines
+_QUIET = 5.0  # s before the first line, and at least between two lines
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def say(message: str) -> None:
-    """A line on progress or on a result."""
+def print_line(message: str) -> None:
+    """Print a line on progress or a result."""
     console.print(message, markup=False)
 
 
 def warn(message: object) -> None:
-    """A note that the reader of the results should know."""
+    """Print a note on the results."""
     console.print(f"note: {message}", style="yellow", markup=False)
 
 
 def refuse(message: str) -> None:
-    """What is wrong with the input."""
+    """Print the error of the input."""
     console.print(f"error: {message}", style="red", markup=False)
 
 
 def read_more(error: Exception) -> str | None:
-    """Where the site says more of why an input was refused, if it does.
+    """The page of the site that explains why an input was refused, if there is one.
 
-    The innermost call that `PAGES` knows decides, by its longest entry.
+    The innermost call with an entry in `PAGES` decides, by its longest entry.
     """
     for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
         package, _, module = frame.f_globals.get("__name__", "").partition(".")
@@ -81,17 +81,17 @@ def read_more(error: Exception) -> str | None:
     return None
 
 
-def tell(result: Any, notes: Iterable[object] | None = None) -> None:
-    """The notes of a pipeline's result, and its headline."""
+def print_result(result: Any, notes: Iterable[object] | None = None) -> None:
+    """Print the notes of a pipeline's result, and its headline."""
     for note in result.notes if notes is None else notes:
         warn(note)
     for line in page_of(result).headline(result):
-        say(line)
+        print_line(line)
 
 
 def written(out: Path, page: str = "report.html") -> None:
-    """Where the results are."""
-    say(f"written to {out}: open {out / page}" if page else f"written to {out}")
+    """Print the path of the results."""
+    print_line(f"written to {out}: open {out / page}" if page else f"written to {out}")
 
 
 class _Latest(logging.Handler):
@@ -107,49 +107,49 @@ class _Latest(logging.Handler):
 def supervised() -> Iterator[None]:
     """Report the stage of a command every few seconds, and end it soon after Ctrl-C.
 
-    Python raises `KeyboardInterrupt` only once the main thread is back from a compiled program,
-    which may take minutes, and then waits for the other threads' programs. So a thread of its own
-    learns of the signal and, where the command has not ended by itself, removes what it has
-    written so far and ends the process.
+    Python raises `KeyboardInterrupt` only after the main thread returns from a compiled program,
+    which may take minutes, and then waits for the other threads' programs. So a separate thread
+    receives the signal and, if the command has not ended by itself, removes its unfinished output
+    and ends the process.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals are the main thread's
+        yield  # signals reach only the main thread
         return
     logger, latest = logging.getLogger("snrmjax"), _Latest(logging.INFO)
     logger.addHandler(latest)
     logger.setLevel(logging.INFO)
-    logger.propagate = False  # stages are no warnings: JAX's handlers would print them again
-    hears, told = socket.socketpair()
-    told.setblocking(False)
-    former = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
-    threading.Thread(target=_supervise, args=(hears, latest), daemon=True).start()
+    logger.propagate = False  # JAX's handlers would print the stages again
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=_supervise, args=(reader, latest), daemon=True).start()
     try:
         yield
     finally:
-        signal.set_wakeup_fd(former)
-        told.close()
+        signal.set_wakeup_fd(previous)
+        writer.close()
         logger.removeHandler(latest)
 
 
-def _supervise(hears: socket.socket, latest: _Latest) -> None:
-    hears.settimeout(_QUIET)
+def _supervise(reader: socket.socket, latest: _Latest) -> None:
+    reader.settimeout(_QUIET)
     began = last = time.monotonic()
-    said, received = "", b"\0"
-    with hears:
+    reported, received = "", b"\0"
+    with reader:
         while received and received[0] != signal.SIGINT:
             try:
-                received = hears.recv(1)
+                received = reader.recv(1)
             except TimeoutError:
                 now = time.monotonic()
-                if latest.message != said or now - last > _STILL:
-                    last, said = now, latest.message
-                    say(f"{now - began:.0f} s: {said or 'at work'} …")
+                if latest.message != reported or now - last > _STILL:
+                    last, reported = now, latest.message
+                    print_line(f"{now - began:.0f} s: {reported or 'at work'} …")
     if not received:  # the command has ended
         return
     time.sleep(_PATIENCE)
     try:
         discard_unfinished()
         console.show_cursor(True)
-        say("stopped.")
+        print_line("stopped.")
     finally:
         os._exit(INTERRUPTED)

@@ -1,7 +1,7 @@
 """The command `demo`."""
 
 import snrmjax as sj
-from snrmjax.cli.console import say, tell, written
+from snrmjax.cli.console import print_line, print_result, written
 from snrmjax.cli.options import Out
 from snrmjax.report.writing import staged
 
@@ -10,7 +10,7 @@ def demo(out: Out) -> None:
     """Run the whole chain on the built-in flat beam.
 
     Simulates, tests, identifies and predicts. Writes the model, simulated responses, the nonlinear
-    normal mode, a virtual test with noise, all that `identify` makes of it, figures and
+    normal mode, a virtual test with noise, all results of `identify`, figures and
     report.html. Takes about a minute.
     """
     import numpy as np
@@ -28,14 +28,14 @@ def demo(out: Out) -> None:
     with staged(out) as folder:
         model = sj.model.flat_beam()
         write_model(folder / "model.toml", model)
-        say("simulating the forced responses of the flat beam")
+        print_line("simulating the forced responses of the flat beam")
         curves = sj.forced_response(model, FLAT_BEAM_FORCES, 60 * HERTZ, 110 * HERTZ)
         sensor = model.modes.sensors[sj.identify.reference_sensor(model.modes)]
         results.write_response(folder / "response.csv", curves, sensor=sensor)
-        say("following its first nonlinear normal mode")
+        print_line("following its first nonlinear normal mode")
         branch = sj.nonlinear_normal_mode(model, 105 * HERTZ)
         results.write_normal_mode(folder / "nnm.csv", branch, sensor=sensor)
-        say("testing it near resonance, with noise")
+        print_line("testing it near resonance, with noise")
         errors = sj.simulate.MeasurementErrors(amplitude=0.005, phase=np.radians(0.3), force=0.002)
         test = sj.phase_resonance_test(
             *(model, np.linspace(1.0e-3, 1.45e-2, 12).tolist(), 60 * HERTZ, 110 * HERTZ),
@@ -43,11 +43,11 @@ def demo(out: Out) -> None:
         )
         data = test.steady_states
         write_steady_states(folder / "steady_states.csv", data)
-        say("identifying backbone and damping, predicting responses")
-        found = identify_test(data, model, predict_force=tuple(FLAT_BEAM_FORCES))
-        found = found._replace(truth=branch, simulated=tuple(curves))
+        print_line("identifying backbone and damping, predicting responses")
+        identified = identify_test(data, model, predict_force=tuple(FLAT_BEAM_FORCES))
+        identified = identified._replace(truth=branch, simulated=tuple(curves))
         source = "a virtual test with seeded noise"
-        page.write(folder, found, title="The chain on the flat beam", data=source)
+        page.write(folder, identified, title="The chain on the flat beam", data=source)
         save_figure(folder / "response.png", simulated_response_figure(curves))
-    tell(found)
+    print_result(identified)
     written(out)

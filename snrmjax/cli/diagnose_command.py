@@ -1,12 +1,12 @@
-"""The command `diagnose`: what a model lacks."""
+"""The command `diagnose`: missing physics of a model."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import say, warn, written
-from snrmjax.cli.options import FILES, Out, asked_for, with_options
+from snrmjax.cli.console import print_line, warn, written
+from snrmjax.cli.options import FILES, Out, stated_options, with_options
 from snrmjax.pipelines.options import DiagnoseOptions
 from snrmjax.report.writing import staged
 
@@ -18,8 +18,8 @@ def diagnose(
     data: Annotated[
         list[Path],
         typer.Argument(
-            help="Measured steady states (CSV), one file or more. A file with `velocity_m_s` in "
-            "place of real and imaginary part has amplitudes without phases.",
+            help="Measured steady states (CSV), one file or more. A file with `velocity_m_s` "
+            "instead of real and imaginary parts has amplitudes without phases.",
             metavar="DATA",
             show_default=False,
         ),
@@ -27,8 +27,8 @@ def diagnose(
     model: Annotated[
         Path,
         typer.Option(
-            help="Model of the structure as it is believed to be (TOML); with several files, one "
-            "of the same name beside a CSV takes its place.",
+            help="Assumed model of the structure (TOML); with several files, a model with the same "
+            "name in the folder of a CSV replaces it.",
             metavar="MODEL",
             rich_help_panel=FILES,
             show_default=False,
@@ -39,47 +39,47 @@ def diagnose(
 ) -> None:
     """Find the physics that a model lacks, with probabilities.
 
-    Where model and data disagree, the effects of the library that would explain it, and what to
-    measure where several would.
+    Where model and data disagree, the effects of the library that explain it, and which
+    measurement decides between several.
 
-    Writes diagnosis.json, figures, report.html and model.toml, the completed model; of several
-    files each into a folder of its own name.
+    Writes diagnosis.json, figures, report.html and model.toml, the completed model; for several
+    files each in a folder of its name.
 
-    Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes say what
-    these data cannot decide.
+    Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes state what the
+    data cannot decide.
     """
     from snrmjax.io.measurement_plans import read_former_answer
     from snrmjax.pipelines.diagnose import diagnose_test, read_test
     from snrmjax.report.pages import diagnosis as page
 
-    asked, several = asked_for(DiagnoseOptions, options), len(data) > 1
+    stated, several = stated_options(DiagnoseOptions, options), len(data) > 1
     for option in ("plan", "add", "former") if several else ():
-        if getattr(asked, option):
+        if getattr(stated, option):
             flag = {"former": "continue"}.get(option, option)
             raise ValueError(f"`--{flag}` is for one data file, but {len(data)} are given.")
-    if asked.plan is not None and not asked.plan.parent.is_dir():
-        raise ValueError(f"--plan {asked.plan} cannot be written: its folder does not exist.")
+    if stated.plan is not None and not stated.plan.parent.is_dir():
+        raise ValueError(f"--plan {stated.plan} cannot be written: its folder does not exist.")
     if len({path.stem for path in data}) < len(data):
         raise ValueError("two of the data files have the same name: they would share a folder.")
-    former = None if asked.former is None else read_former_answer(asked.former)
-    simulate = not several if asked.responses is None else asked.responses
+    former = None if stated.former is None else read_former_answer(stated.former)
+    simulate = not several if stated.responses is None else stated.responses
     refused = []
     for path in data:
-        beside = path.with_suffix(".toml")
+        own_model = path.with_suffix(".toml")
         try:
             with staged(out / path.stem if several else out) as folder:
-                given = beside if several and beside.exists() else model
-                structure, measured = read_test(path, given, asked.add)
+                given = own_model if several and own_model.exists() else model
+                structure, measured = read_test(path, given, stated.add)
                 for note in measured.notes:
                     warn(note)
-                places = [one.strip() for one in asked.where.split(",") if one.strip()]
-                found = diagnose_test(
-                    measured, structure, simulate=simulate, former=former, where=places
+                points = [one.strip() for one in stated.where.split(",") if one.strip()]
+                diagnosed = diagnose_test(
+                    measured, structure, simulate=simulate, former=former, where=points
                 )
                 title = path.stem.replace("_", " ")
-                page.write(folder, found, title=title, data=path.name)
-                if asked.plan is not None:
-                    _write_plan(asked.plan, found.diagnosis)
+                page.write(folder, diagnosed, title=title, data=path.name)
+                if stated.plan is not None:
+                    _write_plan(stated.plan, diagnosed.diagnosis)
         except ValueError as error:
             if not several:
                 raise
@@ -87,11 +87,11 @@ def diagnose(
             refused.append(path.name)
             continue
         if not several:
-            for said in found.diagnosis.notes:
-                warn(said)
-        say(f"{path.name}: {page.answer_in_words(found)}")
-        for line in page.headline(found):
-            say(f"  {line}")
+            for note in diagnosed.diagnosis.notes:
+                warn(note)
+        print_line(f"{path.name}: {page.answer_in_words(diagnosed)}")
+        for line in page.headline(diagnosed):
+            print_line(f"  {line}")
     if not several:
         written(out)
     if refused:
@@ -101,17 +101,17 @@ def diagnose(
 with_options(diagnose, DiagnoseOptions)
 
 
-def _write_plan(file: Path, found: "Diagnosis") -> None:
-    """Write what to measure next, or say why there is nothing to measure."""
+def _write_plan(file: Path, diagnosis: "Diagnosis") -> None:
+    """Write the measurement plan, or warn why there is none."""
     from snrmjax.diagnose.measurement_plan import measurement_plan
     from snrmjax.io.measurement_plans import write_plan
 
-    asked = measurement_plan(found)
-    if asked is None:
-        why = "what would decide is no measurement of steady states."
-        if found.decide_by is None:
-            why = "nothing is open that a measurement would decide."
+    plan = measurement_plan(diagnosis)
+    if plan is None:
+        why = "no measurement of steady states would decide."
+        if diagnosis.decide_by is None:
+            why = "no open question remains that a measurement would decide."
         warn(f"no plan is written to {file}: {why}")
         return
-    write_plan(file, asked)
-    say(f"  {asked.states.n_states} steady states to be measured are written to {file}")
+    write_plan(file, plan)
+    print_line(f"  {plan.states.n_states} steady states to be measured are written to {file}")

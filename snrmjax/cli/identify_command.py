@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from snrmjax.cli.console import tell, written
-from snrmjax.cli.options import Linear, Out, asked_for, with_options
+from snrmjax.cli.console import print_result, written
+from snrmjax.cli.options import Linear, Out, stated_options, with_options
 from snrmjax.pipelines.options import IdentifyOptions
 from snrmjax.report.writing import staged
 
@@ -36,14 +36,14 @@ def identify(
 ) -> None:
     """Identify backbone and damping from steady states, and predict responses.
 
-    State by state with curves through the points, or by one joint fit of all states, which knows
-    errors that the states of a level share (asked for by --fit, --free or --next).
+    State by state with curves through the points, or by one joint fit of all states, which models
+    errors common to the states of a level (requested by --fit, --free or --next).
 
     Families of --fit: auto, polynomial:2, power_law, spline:5, smoothing_spline; for damping also
-    constant, viscous_quadratic, viscous_coulomb, viscous_microslip. :2 is the size (left out: the
-    simplest in the smooth curve's band), @velocity the amplitude. Where only --free or --next asks
-    for a joint fit, the families are auto,auto. The force_gain of --free is in N per V for data
-    with drive_v.
+    constant, viscous_quadratic, viscous_coulomb, viscous_microslip. :2 is the order (left out: the
+    simplest in the smooth curve's band), @velocity the amplitude. Where only --free or --next
+    requests a joint fit, the families are auto,auto. The force_gain of --free is in N per V for
+    data with drive_v.
 
     Writes points.csv, backbone.csv, summary.json, figures and report.html; with predictions
     also prediction.csv, with a joint fit fit.json, with --next also next.csv.
@@ -53,13 +53,13 @@ def identify(
     from snrmjax.pipelines.identify import identify_test
     from snrmjax.report.pages import identified_test as page
 
-    asked = asked_for(IdentifyOptions, options)
+    stated = stated_options(IdentifyOptions, options)
     with staged(out) as folder:
         structure = read_model(model)
-        found = identify_test(read_steady_states(data, structure), structure, asked)
+        identified = identify_test(read_steady_states(data, structure), structure, stated)
         files = {"data": data.name, "model": f"{structure.name} ({model.name})"}
-        page.write(folder, found, title=data.stem.replace("_", " "), axis=axis, **files)
-    tell(found)
+        page.write(folder, identified, title=data.stem.replace("_", " "), axis=axis, **files)
+    print_result(identified)
     written(out)
 
 

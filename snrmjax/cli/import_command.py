@@ -1,4 +1,4 @@
-"""The command `import`: what a laboratory's files hold, and their way to our tables."""
+"""The command `import`: contents of laboratory files, and their conversion to our tables."""
 
 import dataclasses
 import os
@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import say, tell
+from snrmjax.cli.console import print_line, print_result
 from snrmjax.cli.options import FILES, with_options
 from snrmjax.io.exchange.import_map import KEYS, RESPONSE_KEYS, ImportMap, MapKey
 from snrmjax.pipelines.options import option
@@ -35,18 +35,18 @@ def import_(
         Path | None,
         typer.Option(
             "--map",
-            help="Map of an earlier import (map.toml); options win over it.",
+            help="Map of an earlier import (map.toml); options override it.",
             metavar="TOML",
             rich_help_panel=FILES,
         ),
     ] = None,
     **options: Any,
 ) -> None:
-    """List what a laboratory's files hold, or write measured.csv of them.
+    """List the contents of laboratory files, or convert them to measured.csv.
 
-    Without channels and map it writes nothing: it prints what the files hold, and a command that
-    imports them. With them it writes measured.csv, steady states as identify takes them, and
-    map.toml with all that was stated, found and assumed, for the next test. Records of free decays
+    Without channels and map it writes nothing: it prints the contents of the files and a command
+    that imports them. With them it writes measured.csv, steady states for identify, and map.toml
+    with all that was stated, detected and assumed, for the next test. Records of free decays
     and broadband tests are written as record.csv.
     """
     from snrmjax.io.exchange.import_map import map_of_options
@@ -57,16 +57,16 @@ def import_(
         typer.echo("\n".join(list_contents(files, **options)))
         return
     if out is None:
-        raise ValueError("where shall measured.csv be written? --out DIR.")
-    found = import_test(files, map_file, **options)
+        raise ValueError("where shall measured.csv be written? State `--out DIR`.")
+    imported = import_test(files, map_file, **options)
     with staged(out) as folder:
-        written = page.write(folder, found, files=[os.path.relpath(file, out) for file in files])
-    tell(found, dict.fromkeys(found.notes))
-    say(f"written to {out}: {', '.join(written)}")
+        written = page.write(folder, imported, files=[os.path.relpath(file, out) for file in files])
+    print_result(imported, dict.fromkeys(imported.notes))
+    print_line(f"written to {out}: {', '.join(written)}")
 
 
 _RESPONSE = MapKey(
-    "channel or column of a response, as CH2:acceleration or CH2:acceleration:g; one a sensor",
+    "channel or column of a response, as CH2:acceleration or CH2:acceleration:g; one per sensor",
     *("NAME[:KIND[:UNIT]]", None),
 )
 
@@ -75,11 +75,11 @@ def _field(name: str, key: MapKey) -> tuple[str, Any, Any]:
     """A key of the map as an option: a switch, a number, a word, or repeated words."""
     default: Any = ImportMap._field_defaults.get(name, ())
     several = isinstance(default, tuple)
-    said = f"{key.meaning[0].upper()}{key.meaning[1:]}{' (repeatable)' * several}."
+    text = f"{key.meaning[0].upper()}{key.meaning[1:]}{' (repeatable)' * several}."
     kind = tuple[str, ...] if several else type(default)
     least = 0 if kind is int else None
     made = option(
-        *(() if several else default, said, key.metavar or None),
+        *(() if several else default, text, key.metavar or None),
         panel=key.group,
         least=least,
         choices=key.choices,

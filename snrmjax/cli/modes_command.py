@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import say, tell
-from snrmjax.cli.options import FILES, asked_for, with_options
+from snrmjax.cli.console import print_line, print_result
+from snrmjax.cli.options import FILES, stated_options, with_options
 from snrmjax.pipelines.options import ModesOptions
 from snrmjax.report.writing import staged
 
@@ -25,7 +25,7 @@ def modes(
         Path,
         typer.Option(
             "--out",
-            help="Model to write (TOML); modes.csv and report.html come beside it.",
+            help="Model to write (TOML); modes.csv and report.html go to its folder.",
             metavar="MODEL",
             rich_help_panel=FILES,
             show_default=False,
@@ -37,9 +37,9 @@ def modes(
     """Find linear modes with their errors and write them as a model.
 
     Poles of all model orders are fitted to all responses together. Low-level stepped sines that
-    harden or soften already are taken at no amplitude, by a joint fit of their levels. Shapes are
-    mass-normalised by the drive point, an added mass, masses at the sensors or a known shape, or
-    refused.
+    already harden or soften are extrapolated to zero amplitude by a joint fit of their levels.
+    Shapes are mass-normalised by the drive point, an added mass, masses at the sensors or a known
+    shape, or refused.
 
     Writes the model (TOML), modes.csv and report.html.
     """
@@ -50,23 +50,23 @@ def modes(
         raise ValueError(f"--out must be a model to write (.toml), but is {out.name!r}.")
     if out.is_dir():
         raise ValueError(f"--out {out} is a folder, but a file to write is expected.")
-    asked = asked_for(ModesOptions, options)
+    stated = stated_options(ModesOptions, options)
     with staged(out.parent) as folder:
-        second = read_modal_sources(asked.with_mass) if asked.with_mass else None
-        found = find_linear_modes(
-            *(read_modal_sources(data), asked),
+        second = read_modal_sources(stated.with_mass) if stated.with_mass else None
+        result = find_linear_modes(
+            *(read_modal_sources(data), stated),
             with_mass=second,
             interest=interest - 1,
             name=out.stem.replace("_", " "),
-            progress=_say_part,
+            progress=_print_part,
         )
-        page.write(folder, found, file=out.name)
-    tell(found)
-    say(f"written to {out}: open {out.parent / 'report.html'}")
+        page.write(folder, result, file=out.name)
+    print_result(result)
+    print_line(f"written to {out}: open {out.parent / 'report.html'}")
 
 
-def _say_part(done: int, parts: int) -> None:
-    say(f"the decay is not linear throughout: part {done} of {parts} fitted")
+def _print_part(done: int, parts: int) -> None:
+    print_line(f"the decay is not linear throughout: part {done} of {parts} fitted")
 
 
 with_options(modes, ModesOptions)

@@ -1,7 +1,7 @@
 """Options and arguments that several commands have, and a help that fits a screen.
 
-`--help` shows the options that have no panel of their own or stand in that of files: those that
-most tests need. Options of a topic stand in its panel, which `--help-all` shows.
+`--help` shows the options that most tests need, those without a panel or in that of files. Options
+of a topic are in its panel, which `--help-all` shows.
 """
 
 import copy
@@ -17,7 +17,7 @@ from typer.core import TyperCommand
 
 from snrmjax.pipelines.options import FILES, checked, flag_of
 
-Asked = TypeVar("Asked")
+Options = TypeVar("Options")
 
 _ALL, _EFFECTS = "help_all", "effects"
 
@@ -53,7 +53,7 @@ Linear = Annotated[
 ]
 Harmonics = Annotated[
     int,
-    typer.Option(help="Harmonics of the motion that are balanced, beside its mean.", min=1, max=99),
+    typer.Option(help="Highest balanced harmonic of the motion.", min=1, max=99),
 ]
 
 
@@ -61,7 +61,7 @@ class Command(TyperCommand):
     """A command whose `--help` has the main options, and `--help-all` all of them."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """What must be stated, then `[OPTIONS]`."""
+        """Required arguments and options, then `[OPTIONS]`."""
         every: list[Any] = ctx.command.params
         arguments = [one for one in every if one.param_type_name == "argument"]
         stated = [one.metavar if one.required else f"[{one.metavar}]" for one in arguments]
@@ -69,7 +69,7 @@ class Command(TyperCommand):
         return [*stated, *(f"{one.opts[0]} {one.metavar}" for one in needed), "[OPTIONS]"]
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """The sentence that says what the command gives, its main options and an example."""
+        """The first sentence of the help, the main options and an example."""
         (sentence, *_), (first, *_) = (
             (text or "").split("\n\n") for text in (self.help, self.epilog)
         )
@@ -92,14 +92,14 @@ class Command(TyperCommand):
 
 
 def _unpanelled(parameter: Any) -> Any:
-    """The same without its panel, and without the line that repeats what the usage says."""
+    """The parameter without its panel, and without repeating the usage."""
     same = copy.copy(parameter)
     same.required, same.rich_help_panel = False, None
     return same
 
 
-def _show_all(context: typer.Context, asked: bool) -> None:
-    if asked:
+def _show_all(context: typer.Context, requested: bool) -> None:
+    if requested:
         context.meta[_ALL] = True
         typer.echo(context.get_help())
         raise typer.Exit
@@ -113,9 +113,9 @@ def add_command(
     *,
     reads_models: bool = False,
 ) -> None:
-    """Give an app a command; its first example stands in `--help`, all in `--help-all`.
+    """Add a command to an app; `--help` shows its first example, `--help-all` all of them.
 
-    One that reads models takes files with a user's own effects too.
+    A command that reads models also accepts files with user-defined effects.
     """
 
     @functools.wraps(command)
@@ -137,8 +137,8 @@ def add_command(
             list[Path],
             typer.Option(
                 "--effects",
-                help="Python file with effects of your own, which is run: models and diagnoses "
-                "know them then (repeatable).",
+                help="Python file with your own effects, which is run: models and diagnoses can "
+                "then use them (repeatable).",
                 metavar="FILE",
                 rich_help_panel="Own effects",
                 show_default=False,
@@ -168,7 +168,7 @@ def add_command(
 
 
 def completion(choices: Sequence[str]) -> Callable[[str], list[str]]:
-    """What a shell completes an option with: one of these words, or several with commas."""
+    """Shell completion of an option by one of these words, or several with commas."""
 
     def complete(incomplete: str) -> list[str]:
         stated, comma, begun = incomplete.rpartition(",")
@@ -178,16 +178,16 @@ def completion(choices: Sequence[str]) -> Callable[[str], list[str]]:
 
 
 def require_positive(option: str, values: Sequence[float], unit: str) -> None:
-    """Raise `ValueError` where a number that an option was given is not above zero."""
+    """Raise `ValueError` for a value of an option that is not above zero."""
     for value in values:
         if not 0 < value < float("inf"):
             raise ValueError(f"`{option}` must be above zero, but is {value:g} {unit}.")
 
 
 def with_options(command: Callable[..., None], *of: Any) -> None:
-    """Give a command, which takes them as `**options`, the options of pipelines (dataclasses).
+    """Add the options of pipelines (dataclasses) to a command that takes `**options`.
 
-    A switch that is off by default has no `--no-` form; a tuple is an option to be repeated.
+    A switch that is off by default has no `--no-` form; a tuple is a repeatable option.
     """
     signature = inspect.signature(command)
     own = [
@@ -199,8 +199,8 @@ def with_options(command: Callable[..., None], *of: Any) -> None:
     command.__signature__ = signature.replace(parameters=[*own, *made])  # type: ignore[attr-defined]
 
 
-def asked_for(kind: type[Asked], options: Mapping[str, Any]) -> Asked:
-    """The options of a pipeline from those that a command was given, if all have an effect."""
+def stated_options(kind: type[Options], options: Mapping[str, Any]) -> Options:
+    """The options of a pipeline from those of a command, if all have an effect."""
     names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
     values = {name: options[name] for name in names}
     return checked(kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}))

@@ -5,12 +5,12 @@ from typing import Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import console, say, tell, written
-from snrmjax.cli.options import Out, asked_for, with_options
+from snrmjax.cli.console import console, print_line, print_result, written
+from snrmjax.cli.options import Out, stated_options, with_options
 from snrmjax.pipelines.options import ReduceOptions
 from snrmjax.report.writing import staged
 
-_SAID = 3  # steps of the study between lines in a log
+_STEPS_A_LINE = 3  # steps of the study between lines in a log
 
 
 def rom(
@@ -34,13 +34,13 @@ def rom(
     from snrmjax.pipelines.reduce import read_reduction_source, reduce_model
     from snrmjax.report.pages import reduction
 
-    asked = asked_for(ReduceOptions, options)
+    stated = stated_options(ReduceOptions, options)
     with staged(out) as folder:
-        source = read_reduction_source(beam, asked)
+        source = read_reduction_source(beam, stated)
         with console.status("static load cases …"):
-            found = reduce_model(source, study=not asked.no_study, report=_progress)
-        reduction.write(folder, found)
-    tell(found)
+            result = reduce_model(source, study=not stated.no_study, report=_progress)
+        reduction.write(folder, result)
+    print_result(result)
     written(out)
 
 
@@ -48,5 +48,5 @@ with_options(rom, ReduceOptions)
 
 
 def _progress(done: int, scales: int) -> None:
-    if not console.is_terminal and (done % _SAID == 0 or done == scales):
-        say(f"load scales: {done} of {scales}")
+    if not console.is_terminal and (done % _STEPS_A_LINE == 0 or done == scales):
+        print_line(f"load scales: {done} of {scales}")

@@ -1,10 +1,10 @@
-"""The commands `simulate` and `nnm`: what a model does."""
+"""The commands `simulate` and `nnm`: responses and normal mode of a model."""
 
 from typing import Annotated, Literal
 
 import typer
 
-from snrmjax.cli.console import say, tell, written
+from snrmjax.cli.console import print_line, print_result, written
 from snrmjax.cli.options import Harmonics, Model, Out, require_positive
 from snrmjax.report.writing import staged
 
@@ -29,9 +29,9 @@ def simulate(
     force: Annotated[
         list[float] | None,
         typer.Option(
-            help="Peak amplitude of the harmonic force in N; where the model has a base that "
-            "moves, of its acceleration in m/s²; where it has an unbalance, how many times that "
-            "of the model (once, if not given). Give it again for further ones.",
+            help="Peak amplitude of the harmonic force in N; for base excitation, of the "
+            "acceleration in m/s²; for an unbalance, as a multiple of the model's (default: 1). "
+            "Repeatable.",
             metavar="N",
             show_default=False,
         ),
@@ -41,7 +41,7 @@ def simulate(
         bool,
         typer.Option(
             "--isolated",
-            help="Also search for responses that are not connected to those of small motion "
+            help="Also search for responses that are not connected to the main branch "
             "(takes longer).",
             rich_help_panel=_MOTIONS,
         ),
@@ -50,7 +50,7 @@ def simulate(
         bool,
         typer.Option(
             "--quasi-periodic",
-            help="Also follow the motions with a second frequency from every Neimark-Sacker "
+            help="Also continue the quasi-periodic motions from every Neimark-Sacker "
             "bifurcation of the responses (quasi_periodic.csv and quasi_periodic.png).",
             rich_help_panel=_MOTIONS,
         ),
@@ -58,7 +58,7 @@ def simulate(
     follow: Annotated[
         EventKind | None,
         typer.Option(
-            help="Also follow events of the responses as a parameter changes (events.csv and "
+            help="Also continue events of the responses over a parameter (events.csv and "
             "events.png).",
             rich_help_panel=_FOLLOWED,
             show_default=False,
@@ -76,8 +76,8 @@ def simulate(
     to: Annotated[
         float | None,
         typer.Option(
-            help="Value that the parameter goes to from its own, in N, rad/s or the unit of the "
-            "effect; a curve that turns before comes back.",
+            help="Final value of the parameter, in N, rad/s or the unit of the effect; a curve "
+            "with a turning point before it returns.",
             rich_help_panel=_FOLLOWED,
             show_default=False,
         ),
@@ -85,8 +85,8 @@ def simulate(
 ) -> None:
     """Simulate responses to a harmonic force, unstable parts included.
 
-    Harmonic balance with arclength continuation around folds. Events are followed over the force or
-    any number of the model, with cusps and isolas on the way. Writes response.csv, response.png,
+    Harmonic balance with arclength continuation around folds. Events are continued over the force
+    or any number of the model, with their cusps and isolas. Writes response.csv, response.png,
     summary.json and report.html.
     """
     from snrmjax.io.models import read_model
@@ -108,7 +108,7 @@ def simulate(
     if follow is None and (to is not None or parameter != "force"):
         raise ValueError("`--parameter` and `--to` need `--follow`, the kind of event.")
     with staged(out) as folder:
-        found = simulate_responses(
+        result = simulate_responses(
             *(structure, loads, from_hz, to_hz),
             harmonics=harmonics,
             isolated=isolated,
@@ -116,10 +116,10 @@ def simulate(
             parameter=parameter,
             to=to,
             quasi_periodic=quasi_periodic,
-            progress=lambda load: say(f"{load:g} {structure.modes.force_unit}"),
+            progress=lambda load: print_line(f"{load:g} {structure.modes.force_unit}"),
         )
-        simulation.write(folder, found)
-    tell(found)
+        simulation.write(folder, result)
+    print_result(result)
     written(out)
 
 
@@ -128,8 +128,7 @@ def nnm(
     to_hz: Annotated[
         float,
         typer.Option(
-            help="Frequency in Hz at which to stop, above the linear one or, for a mode that "
-            "softens, below it.",
+            help="Final frequency in Hz, above the linear one or, for a softening mode, below it.",
             metavar="HZ",
             show_default=False,
         ),
@@ -139,7 +138,7 @@ def nnm(
     tongues: Annotated[
         Literal["follow", "skip"],
         typer.Option(
-            help="Where an internal resonance lets the mode run out and back: follow this tongue, "
+            help="At an internal resonance the mode has a tongue (out and back): follow it, "
             "or skip it."
         ),
     ] = "follow",
@@ -155,7 +154,7 @@ def nnm(
 
     require_positive("--to-hz", [to_hz], "Hz")
     with staged(out) as folder:
-        found = simulate_mode(read_model(model), to_hz, harmonics=harmonics, tongues=tongues)
-        simulation.write(folder, found)
-    tell(found)
+        result = simulate_mode(read_model(model), to_hz, harmonics=harmonics, tongues=tongues)
+        simulation.write(folder, result)
+    print_result(result)
     written(out, "")

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import INTERRUPTED, console, say, warn
-from snrmjax.cli.options import FILES, Out, add_command, asked_for, with_options
+from snrmjax.cli.console import INTERRUPTED, console, print_line, warn
+from snrmjax.cli.options import FILES, Out, add_command, stated_options, with_options
 from snrmjax.pipelines.options import option
 from snrmjax.report.writing import staged
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _QUIET_SECONDS = 30.0  # between lines of progress in a log
 
-_ROWS_SAID = 12  # of the summary on the screen
+_ROWS_SHOWN = 12  # of the summary on the screen
 
 study_app = typer.Typer(
     name="study",
@@ -49,7 +49,7 @@ StudyOut = Annotated[
 
 @dataclasses.dataclass(frozen=True)
 class StudyOptions:
-    """What `study run` may be asked for."""
+    """Options of `study run`."""
 
     processes: int | None = option(
         None,
@@ -64,18 +64,18 @@ class StudyOptions:
     )
     shard: str | None = option(
         None,
-        "Compute the I-th of N parts only, on a shared folder; the one that ends last makes the "
+        "Compute only the I-th of N parts, on a shared folder; the last one to end makes the "
         "data set.",
         "I/N",
     )
-    quiet: bool = option(False, "Say nothing but what is wrong.")
+    quiet: bool = option(False, "Print errors and warnings only.")
 
 
 def run(
     file: Annotated[
         Path,
         typer.Argument(
-            help="What varies and what is computed (TOML).", metavar="STUDY", show_default=False
+            help="Varied quantities and computation (TOML).", metavar="STUDY", show_default=False
         ),
     ],
     out: StudyOut,
@@ -83,37 +83,36 @@ def run(
 ) -> None:
     """Run a study, or continue one that was stopped: the same command again.
 
-    Writes the data set OUT. Stopped at any moment, it loses only what was being computed then.
-    While the data set is not complete, and to mend it, its parts are kept beside it in OUT.parts;
-    remove them to save disk.
+    Writes the data set OUT. Stopping loses only the chunks in progress. The parts are kept in
+    OUT.parts, to complete or repair the data set; remove them to save disk.
     """
     from snrmjax.study.execution import ClusterGone
     from snrmjax.study.run import run_study
     from snrmjax.study.study_file import read_study
 
-    asked = asked_for(StudyOptions, options)
-    quiet = asked.quiet
-    part = (1, 1) if asked.shard is None else _shard(asked.shard)
+    stated = stated_options(StudyOptions, options)
+    quiet = stated.quiet
+    part = (1, 1) if stated.shard is None else _shard(stated.shard)
     study = read_study(file)
     if not quiet:
-        _say_study(study)
+        _print_study(study)
     try:
         with _progress(quiet) as progress:
             done = run_study(
                 *(study, out),
-                processes=asked.processes,
-                scheduler=asked.scheduler,
+                processes=stated.processes,
+                scheduler=stated.scheduler,
                 shard=part,
                 progress=progress,
             )
     except KeyboardInterrupt:
-        warn("stopped; the same command continues.")
+        warn("stopped; the same command continues the study.")
         sys.exit(INTERRUPTED)
     except ClusterGone as error:
-        warn(f"{error}; what is done stays, and the same command continues with a new one.")
+        warn(f"{error}; completed chunks are kept, and the same command continues with a new one.")
         sys.exit(1)
     if not quiet:
-        _say_done(done, out)
+        _print_done(done, out)
 
 
 with_options(run, StudyOptions)
@@ -140,10 +139,10 @@ def report(
 
     data = open_study(store)
     with staged(out) as folder:
-        found = write_study_report(folder, data)
-    say(members_ended(found))
-    _say_summary(found)
-    say(f"written to {out}")
+        results = write_study_report(folder, data)
+    print_line(members_ended(results))
+    _print_summary(results)
+    print_line(f"written to {out}")
 
 
 add_command(study_app, report, "report", ("snrmjax study report study.zarr --out report",))
@@ -156,65 +155,65 @@ def _shard(text: str) -> tuple[int, int]:
     return int(part), int(parts)
 
 
-def _say_study(study: "Study") -> None:
-    names = ", ".join(study.names) or "nothing but the noise"
-    told = f"; velocities at {study.sensor_told}" if study.sensor_told else ""
-    say(
+def _print_study(study: "Study") -> None:
+    names = ", ".join(study.names) or "only the noise"
+    at_sensor = f"; velocities at {study.sensor_told}" if study.sensor_told else ""
+    print_line(
         f"{study.name}: {study.n_members} members ({study.computation.kind}) in {study.n_chunks} "
-        f"chunks; {names} {'vary' if len(study.names) > 1 else 'varies'}{told}"
+        f"chunks; {names} {'vary' if len(study.names) > 1 else 'varies'}{at_sensor}"
     )
 
 
-def _say_done(done: "StudyRun", out: Path) -> None:
+def _print_done(done: "StudyRun", out: Path) -> None:
     if done.damaged_chunks:
         warn(f"{done.damaged_chunks} chunks were damaged; they were computed again.")
     if done.failed and not done.complete:
         warn(f"{done.failed} of {done.computed} members have no whole result: see `status`.")
     if not done.complete:
-        say(f"this shard is done; {done.missing_chunks} chunks are left to other shards.")
+        print_line(f"this shard is done; {done.missing_chunks} chunks are left to other shards.")
     elif done.computed:
         from snrmjax.report.study.study_report import members_ended
         from snrmjax.study.analysis.digest import digest
 
-        found = digest(done.open())
-        (warn if found.failures.n_failed else say)(members_ended(found))
-        for fact in found.failures.facts:
-            say(str(fact))
-        _say_summary(found)
-        say(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
-        say(f"figures and tables of it: snrmjax study report {out} --out report")
+        results = digest(done.open())
+        (warn if results.failures.n_failed else print_line)(members_ended(results))
+        for fact in results.failures.facts:
+            print_line(str(fact))
+        _print_summary(results)
+        print_line(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
+        print_line(f"for figures and tables: snrmjax study report {out} --out report")
     else:
-        say(f"nothing was left to compute; {done.members} members are in {out}")
+        print_line(f"nothing was left to compute; {done.members} members are in {out}")
 
 
-def _say_summary(found: "StudyDigest") -> None:
-    """The outputs that vary, as a table."""
+def _print_summary(results: "StudyDigest") -> None:
+    """Print the outputs that vary, as a table."""
     from rich.table import Table
     from rich.text import Text
 
     from snrmjax.report.study.study_report import summary_table
 
     rows = [
-        row for row in found.summaries if (row.varies or row.outside) and not row.scalar.is_count
+        row for row in results.summaries if (row.varies or row.outside) and not row.scalar.is_count
     ]
-    shown = summary_table(rows[:_ROWS_SAID], "")
+    shown = summary_table(rows[:_ROWS_SHOWN], "")
     table = Table(box=None)
     columns = ("output", "unit", "members", "median", "95 % range")
-    said = [shown.header.index(name) for name in columns]
-    for k in said:
+    shown_columns = [shown.header.index(name) for name in columns]
+    for k in shown_columns:
         table.add_column(shown.header[k], no_wrap=k > 0)
     for row in shown.rows:
-        table.add_row(*(Text(row[k]) for k in said))
+        table.add_row(*(Text(row[k]) for k in shown_columns))
     console.print(table)
-    if len(rows) > _ROWS_SAID:
-        say(f"and {len(rows) - _ROWS_SAID} more outputs")
-    if found.sensor:
-        say(f"velocities and their peaks are those at {found.sensor}")
+    if len(rows) > _ROWS_SHOWN:
+        print_line(f"and {len(rows) - _ROWS_SHOWN} more outputs")
+    if results.sensor:
+        print_line(f"velocities and their peaks are those at {results.sensor}")
 
 
 @contextmanager
 def _progress(quiet: bool) -> Iterator["ProgressReport | None"]:
-    """A bar on a terminal, a line now and then in a log, nothing where nobody wants it."""
+    """A bar on a terminal, lines in a log, nothing with `--quiet`."""
     if quiet:
         yield None
         return
@@ -235,18 +234,18 @@ def _progress(quiet: bool) -> Iterator["ProgressReport | None"]:
 
 
 class _Lines:
-    """Progress as lines, not more often than every half minute."""
+    """Progress as lines, at most every half minute."""
 
     def __init__(self) -> None:
         self.last = time.monotonic()
 
     def __call__(self, now: "Progress") -> None:
-        """Say where the run stands."""
+        """Print the progress of the run."""
         if now.done < now.members and time.monotonic() - self.last < _QUIET_SECONDS:
             return
         self.last = time.monotonic()
         left = f", {_duration(now.seconds_left)} left" if now.done < now.members else ""
-        say(_line(now) + left)
+        print_line(_line(now) + left)
 
 
 def _line(now: "Progress") -> str:

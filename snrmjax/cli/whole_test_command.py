@@ -1,12 +1,12 @@
-"""The command `test`: a folder of a laboratory's files to one report."""
+"""The command `test`: one report from a folder of laboratory files."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from snrmjax.cli.console import say, tell, written
-from snrmjax.cli.options import Out, asked_for, with_options
+from snrmjax.cli.console import print_line, print_result, written
+from snrmjax.cli.options import Out, stated_options, with_options
 from snrmjax.pipelines.options import WholeTestOptions
 from snrmjax.report.writing import staged
 
@@ -27,25 +27,27 @@ def whole_test(
 ) -> None:
     """From a folder of raw files to one report: check, linear modes, backbone, diagnosis.
 
-    Files are sorted by their content. Where a guess would be needed the command stops with a
+    Files are classified by their content. Where the input is ambiguous the command stops with a
     question and the option that answers it.
 
     Writes report.html (zoom, hover, linked levels), measured.csv, check.json, model.toml
-    where the linear modes were found here, and the files of identify and diagnose in folders of
+    where the linear modes are identified here, and the files of identify and diagnose in folders of
     these names.
     """
     from snrmjax.pipelines.whole_test import run_whole_test
     from snrmjax.report.pages import whole_test as page
 
     with staged(out) as target:
-        found = run_whole_test(folder, asked_for(WholeTestOptions, options), progress=_say_stage)
-        page.write(target, found)
-    tell(found)
+        result = run_whole_test(
+            folder, stated_options(WholeTestOptions, options), progress=_print_stage
+        )
+        page.write(target, result)
+    print_result(result)
     written(out)
 
 
-def _say_stage(stage: str, seconds: float) -> None:
-    say(f"{stage}: {seconds:.1f} s")
+def _print_stage(stage: str, seconds: float) -> None:
+    print_line(f"{stage}: {seconds:.1f} s")
 
 
 with_options(whole_test, WholeTestOptions)

@@ -1,9 +1,8 @@
 """Reduced-order models from finite elements, by implicit condensation.
 
-Static load cases of a geometrically nonlinear finite-element model, each a combination of mode
-shapes as forces, give modal displacements; one potential V(q) is fitted to all of them. Motions
-that follow the modes statically (membrane stretching above all) are in it without a coordinate of
-their own.
+Static load cases of a geometrically nonlinear finite-element model, each with a combination of
+modal forces, give modal displacements; one potential V(q) is fitted to all of them. Motions that
+follow the modes statically (above all membrane stretching) are condensed into it.
 
 References: J. J. Hollkamp & R. W. Gordon, J. Sound Vib. 318 (2008) 1139,
 doi:10.1016/j.jsv.2008.04.035; R. J. Kuether, B. J. Deaner, J. J. Hollkamp & M. S. Allen,

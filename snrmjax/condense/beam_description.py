@@ -1,4 +1,4 @@
-"""A beam or arch by its numbers, before it has finite elements."""
+"""Description of a beam or arch by its dimensions, before meshing."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -9,7 +9,7 @@ SIDES = ("left", "right")
 STIFFNESSES = ("axial_n_m", "transverse_n_m", "rotation_nm_rad")
 
 POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
-MOST_RISE = 0.95  # of the length over twice the radius: an arch below a half circle
+MAX_RISE = 0.95  # limit of length over twice the radius: an arch below a half circle
 
 
 RISE, RADIUS = "geometry.rise_m", "geometry.radius_m"
@@ -17,11 +17,11 @@ LENGTH, THICKNESS = "geometry.length_m", "section.thickness_m"
 
 
 class BeamDescription(NamedTuple):
-    """A beam or arch as its file says.
+    """A beam or arch as described by its file.
 
     `numbers` have the names of tables and keys ("section.thickness_m"), stiffnesses of a support
-    "supports.left.rotation_nm_rad" (infinite: held) and point masses "point_mass_1.mass_kg". Those
-    that the file does not state are missing.
+    "supports.left.rotation_nm_rad" (infinite: fixed) and point masses "point_mass_1.mass_kg".
+    Optional ones not in the file are missing.
     """
 
     name: str
@@ -36,15 +36,15 @@ class BeamDescription(NamedTuple):
     masses_at: tuple[float, ...] = ()  # fractions of the length
 
 
-def what_is_loose(numbers: Mapping[str, float]) -> str | None:
-    """Which rigid-body motion the two supports leave, in words, or nothing."""
+def unconstrained_motion(numbers: Mapping[str, float]) -> str | None:
+    """A rigid-body motion that the two supports leave free, as text, or None."""
     axial, transverse, rotation = (
         [numbers[f"supports.{side}.{key}"] for side in SIDES] for key in STIFFNESSES
     )
     if not any(axial):
-        return "nothing holds the beam along its axis"
+        return "nothing fixes the beam along its axis"
     if not any(transverse):
-        return "nothing holds the beam across its axis"
+        return "nothing fixes the beam across its axis"
     if not (all(transverse) or any(rotation)):
-        return "nothing keeps the beam from turning"
+        return "nothing prevents rotation of the beam"
     return None

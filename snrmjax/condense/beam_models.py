@@ -1,4 +1,4 @@
-"""The reduced models of one beam by its numbers: for studies, calibrations and derivatives."""
+"""Reduced models of a parametrised beam: for studies, calibrations and derivatives."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,15 +23,15 @@ from snrmjax.model.parameters import parameter_names, with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled
 
-_FORCE = "force_n"  # of a study: it is no number of the beam
+_FORCE = "force_n"  # a parameter of the study, not of the beam
 
 
 class BeamModels(eqx.Module):
-    """Reduced models of a beam by its numbers; make it with `snrmjax.io.read_beam_models`.
+    """Reduced models of a parametrised beam, from `snrmjax.io.read_beam_models`.
 
-    Call it with values by name, as `parameters` has them, to get the model of that beam. The load
-    cases keep their size in thicknesses (`displacement`, one number a mode), so that the model is
-    a smooth function of the numbers.
+    Call it with parameter values by name (see `parameters`) to get the model of that beam. The
+    load cases have a fixed scale in thicknesses (`displacement`, one number per mode), so that the
+    model is a smooth function of the parameters.
     """
 
     stated: BeamDescription = eqx.field(static=True)
@@ -40,21 +40,21 @@ class BeamModels(eqx.Module):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The numbers that may vary, by name, with the values that the file states (SI units)."""
+        """The parameters by name, with their values in the file (SI units)."""
         return beam_parameters(self.stated)
 
     def __call__(self, values: Mapping[str, float | Float[Array, ""]]) -> Structure:
-        """The reduced model of the beam with other numbers.
+        """The reduced model of the beam with other parameter values.
 
-        Geometry → linear modes → static load cases → one potential. The numbers of the model are
-        differentiable functions of `values`, in forward and in reverse mode and twice.
+        Geometry → linear modes → static load cases → one potential. The coefficients of the model
+        are differentiable functions of `values`, in forward and reverse mode and twice.
 
-        Arguments: `values` by the names of `parameters`; what is not named is as in the file. Names
-        of the model (`snrmjax.model.parameter_names`, such as "mode_1.damping_ratio") change the
-        reduced model itself; "force_n" is passed over, since it belongs to a test.
-        Returns the model; within `jax.jit` and derivatives, where nothing can be checked, its
-        coefficients are NaN where a load case has no solution. Raises `ValueError` for a name
-        that neither has, for numbers that no beam has, and where the load cases determine no model.
+        Arguments: `values` by the names of `parameters`; the others are as in the file. Names of
+        the model (`snrmjax.model.parameter_names`, such as "mode_1.damping_ratio") change the
+        reduced model itself; "force_n" is ignored, since it belongs to a test.
+        Returns the model; within `jax.jit` and derivatives there are no checks, and coefficients
+        are NaN if a load case has no solution. Raises `ValueError` for an unknown name, for an
+        impossible beam, and if the load cases do not determine the model.
         """
         varied = {name: value for name, value in values.items() if name in self.parameters}
         rest = [name for name in values if name not in varied and name != _FORCE]
@@ -78,5 +78,5 @@ def _model(models: BeamModels, values: Mapping[str, Any]) -> Structure:
     return source.structure(reduced_model(source.basis, cases, degree=source.degree))
 
 
-# One program: step by step, derivatives would compile each step.
+# One program: otherwise derivatives would compile every operation by itself.
 _traced_model = compiled(_model)

@@ -1,4 +1,4 @@
-"""The numbers of a beam by name, as its file names them: what a study of beams varies."""
+"""Parameters of a beam by their names in its file: the ones that a study can vary."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.condense.beam_description import (
     LENGTH,
-    MOST_RISE,
+    MAX_RISE,
     POISSON,
     RADIUS,
     RISE,
@@ -17,22 +17,22 @@ from snrmjax.condense.beam_description import (
     STIFFNESSES,
     THICKNESS,
     BeamDescription,
-    what_is_loose,
+    unconstrained_motion,
 )
 from snrmjax.condense.elements.beam import rise_of_radius
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, Rule
 
-_HELD = "it is held there; to vary its stiffness state one, such as {side} = {{ {key} = 1e6 }}"
+_FIXED = "it is fixed there; to vary its stiffness state one, such as {side} = {{ {key} = 1e6 }}"
 
 
 def beam_parameters(beam: BeamDescription) -> dict[str, float]:
-    """The numbers of a beam that may vary, by name, in SI units.
+    """The parameters of a beam by name, in SI units.
 
-    Those of its file, but a direction in which a support holds the beam has no stiffness. Every
-    beam has a "geometry.rise_m", the height of the arc over its chord, zero where it is straight.
+    Those of its file, without the stiffness of fixed directions of a support. Every beam has a
+    "geometry.rise_m", the height of the arc over its chord, zero if straight.
     """
-    with jax.ensure_compile_time_eval():  # what the file states has a value within `jit`, too
+    with jax.ensure_compile_time_eval():  # concrete within `jit`, too
         rise = float(rise_of(beam))
     return {name: value for name, value in (*beam.numbers, (RISE, rise)) if value != np.inf}
 
@@ -46,9 +46,9 @@ def rise_of(beam: BeamDescription) -> float | Float[Array, ""]:
 
 
 def check_beam_name(beam: BeamDescription, name: str, file: str, further: tuple[str, ...]) -> None:
-    """Refuse a name that is none of the beam's numbers, nor among `further` ones.
+    """Check that a name is one of the beam's parameters or of `further` ones.
 
-    Raises `ValueError` that says why, with a near miss.
+    Raises `ValueError` with the reason and a near miss.
     """
     known = (*beam_parameters(beam), *further)
     if name in known:
@@ -60,7 +60,7 @@ def check_beam_name(beam: BeamDescription, name: str, file: str, further: tuple[
     elif name == "material.poisson":
         why = f"{name} cannot vary: {file} states none, which means no shear deformation."
     elif table == "supports" and side in SIDES and key in STIFFNESSES:
-        why = f"{name} cannot vary in {file}: {_HELD.format(side=side, key=key)}."
+        why = f"{name} cannot vary in {file}: {_FIXED.format(side=side, key=key)}."
     else:
         # "thickness_m" alone, too, is near to "section.thickness_m".
         ends = {parameter.rpartition(".")[2]: parameter for parameter in reversed(known)}
@@ -70,7 +70,7 @@ def check_beam_name(beam: BeamDescription, name: str, file: str, further: tuple[
 
 
 def beam_rules(beam: BeamDescription, name: str, varied: tuple[str, ...]) -> tuple[Rule, ...]:
-    """What a number of a beam must be, as in its file; against others that do not vary."""
+    """Rules of a parameter, as in the file; relative to others that do not vary."""
     if name.startswith(("supports.", "point_mass_")) or name == RISE:
         return (NOT_NEGATIVE,)
     if name == "material.poisson":
@@ -83,14 +83,14 @@ def beam_rules(beam: BeamDescription, name: str, varied: tuple[str, ...]) -> tup
             rules.append(_above("the thickness", numbers[THICKNESS]))
     if RADIUS in numbers and not {RADIUS, LENGTH} <= set(varied):
         if name == LENGTH and RISE not in varied:
-            rules.append(_below("what the radius allows", 2 * MOST_RISE * numbers[RADIUS]))
+            rules.append(_below("what the radius allows", 2 * MAX_RISE * numbers[RADIUS]))
         if name == RADIUS:
-            rules.append(_above("what the length allows", numbers[LENGTH] / (2 * MOST_RISE)))
+            rules.append(_above("what the length allows", numbers[LENGTH] / (2 * MAX_RISE)))
     return tuple(rules)
 
 
 def with_beam_parameters(beam: BeamDescription, values: Mapping[str, Any]) -> BeamDescription:
-    """The beam with other numbers, which derivatives may be taken by; nothing is checked.
+    """The beam with other parameter values, unchecked and differentiable.
 
     A rise replaces the radius.
     """
@@ -101,12 +101,12 @@ def with_beam_parameters(beam: BeamDescription, values: Mapping[str, Any]) -> Be
 
 
 def require_beam(beam: BeamDescription) -> None:
-    """Raises `ValueError` for numbers that no beam has together."""
+    """Raises `ValueError` for inconsistent parameters."""
     numbers = dict(beam.numbers)
     length, thickness, radius = numbers[LENGTH], numbers[THICKNESS], numbers.get(RADIUS)
     if not thickness < length:
         raise ValueError(f"the thickness ({thickness:g} m) is not below the length ({length:g} m).")
-    if radius is not None and not length < 2 * MOST_RISE * radius:
+    if radius is not None and not length < 2 * MAX_RISE * radius:
         raise ValueError(
             f"a radius of {radius:g} m is too small for a length of {length:g} m: the "
             "arch must stay below a half circle."
@@ -116,7 +116,7 @@ def require_beam(beam: BeamDescription) -> None:
             f"a rise of {rise_of(beam):g} m is too large for a length of {length:g} m: the "
             "arch must stay below a half circle."
         )
-    loose = what_is_loose(numbers)
+    loose = unconstrained_motion(numbers)
     if loose is not None:
         raise ValueError(f"the supports leave a mechanism: {loose}.")
 

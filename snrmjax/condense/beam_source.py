@@ -1,4 +1,4 @@
-"""A beam as what a reduced-order model is made from: its finite elements and their modes."""
+"""A beam as the source of a reduced-order model: finite elements and modes."""
 
 from typing import NamedTuple
 
@@ -25,26 +25,26 @@ from snrmjax.model.modes import have_values
 from snrmjax.numerics.facts import Fact
 
 _BLOCK = 8  # load cases at once
-_NOWHERE = 1e-9  # of the largest shape: a sensor that no mode moves
+_NODE = 1e-9  # of the largest shape, below which a point is a node of all modes
 
 
 def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
     """Prepare finite elements, modes and load cases of a beam; messages name its `file`.
 
-    Beams that differ in numbers alone share their compiled programs. Numbers that are traced
-    (within `jax.jit` and derivatives) are taken as they are. Raises `ValueError` where the
-    elements have no such modes or a sensor or force is at a place that none of them moves.
+    Beams that differ only in their dimensions share compiled programs. Traced numbers (within
+    `jax.jit` and derivatives) are not checked. Raises `ValueError` for modes that the mesh does
+    not have, and for a sensor or force at a node of all modes.
     """
     beam = beam_of(stated)
     try:
         basis = beam_modes(beam, stated.modes)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
-    seen = _seen_of(beam, basis, stated.sensors, stated.force_at)
-    known = have_values((basis, seen))
+    modal = _modal_data(beam, basis, stated.sensors, stated.force_at)
+    known = have_values((basis, modal))
     if known:
-        seen = jax.tree.map(np.asarray, seen)
-        _require_moving(stated, seen, file)
+        modal = jax.tree.map(np.asarray, modal)
+        _require_moving(stated, modal, file)
 
     def solve(force: Float[np.ndarray, "case mode"]) -> StaticCases:
         if not known:
@@ -56,30 +56,30 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
         name=stated.name,
         basis=basis,
         damping_ratio=np.array(damping or (ASSUMED_DAMPING,) * len(stated.modes)),
-        sensors=seen.sensors,
-        participation=seen.participation,
+        sensors=modal.sensors,
+        participation=modal.participation,
         solve=solve,
         thickness=dict(stated.numbers)[THICKNESS],
         load_scale=stated.load_scale,
         degree=stated.degree,
         # Rows of the shapes are x, y and rotation of each node.
-        lines=ShapeLines(seen.position, basis.shapes[1::3], "Position along the chord (m)"),
+        lines=ShapeLines(modal.position, basis.shapes[1::3], "Position along the chord (m)"),
         notes=() if damping else (Fact("damping_assumed", ratio=ASSUMED_DAMPING),),
     )
 
 
-def _require_moving(stated: BeamDescription, seen: "_SeenModes", file: str) -> None:
-    largest = float(np.max(seen.largest))
+def _require_moving(stated: BeamDescription, modal: "_ModalData", file: str) -> None:
+    largest = float(np.max(modal.largest))
     for name, at in stated.sensors:
-        if not np.max(np.abs(seen.sensors[name])) > _NOWHERE * largest:
+        if not np.max(np.abs(modal.sensors[name])) > _NODE * largest:
             raise ValueError(f"[sensors] of {file} has `{name}` at {at:g}, where no mode moves.")
-    if not np.max(np.abs(seen.participation)) > _NOWHERE * largest:
-        place = "uniform" if stated.force_at is None else f"at {stated.force_at:g}"
-        raise ValueError(f"[force] of {file} is {place}, where no mode moves.")
+    if not np.max(np.abs(modal.participation)) > _NODE * largest:
+        position = "uniform" if stated.force_at is None else f"at {stated.force_at:g}"
+        raise ValueError(f"[force] of {file} is {position}, where no mode moves.")
 
 
-class _SeenModes(NamedTuple):
-    """What sensors and the force see of the modes."""
+class _ModalData(NamedTuple):
+    """Mode shapes at the sensors and participation of the force."""
 
     sensors: dict[str, Float[Array, " mode"]]  # kg^-1/2
     participation: Float[Array, " mode"]  # per newton, kg^-1/2
@@ -88,14 +88,14 @@ class _SeenModes(NamedTuple):
 
 
 @eqx.filter_jit
-def _seen_of(
+def _modal_data(
     beam: Beam,
     basis: ReductionBasis,
     sensors: tuple[tuple[str, float], ...],
     force_at: float | None,
-) -> _SeenModes:
-    """Shapes at the sensors and participation of the force; places are fractions of the length."""
-    return _SeenModes(
+) -> _ModalData:
+    """Shapes at the sensors and participation of the force; positions are fractions of length."""
+    return _ModalData(
         {name: shape_at(beam, basis, at) for name, at in sensors},
         participation(beam, basis, force_at),
         basis.largest,
@@ -125,7 +125,7 @@ def beam_of(stated: BeamDescription) -> Beam:
 
 
 def _in_blocks(solve: StaticSolver, force: Float[np.ndarray, "case mode"]) -> StaticCases:
-    """Load cases by blocks of one size, so that one program serves any number of them."""
+    """Load cases in blocks of fixed length, so that one program serves any number of them."""
     count = len(force)
     rows = np.resize(np.arange(count), -(-count // _BLOCK) * _BLOCK)
     blocks = [solve(np.asarray(force)[part]) for part in rows.reshape(-1, _BLOCK)]

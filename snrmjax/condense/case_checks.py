@@ -1,4 +1,4 @@
-"""What is wrong with static load cases: which of them, or all."""
+"""Plausibility checks of static load cases, individually and together."""
 
 from typing import Any, NamedTuple
 
@@ -16,19 +16,19 @@ from snrmjax.condense.potential_fit import (
 from snrmjax.model.potential import PolynomialPotential
 from snrmjax.numerics.facts import Fact
 
-_GOOD = 0.01  # residual over nonlinear force that needs no word
-_EXPLAINED = 0.3  # of the residual, left by two more degrees: then the polynomial was too short
-_ROUND_OFF = 1e-9  # residual over linear force below which nothing can be told
-_SMALL = 1e-3  # nonlinear over linear force that a table of six digits cannot show
+_GOOD = 0.01  # residual over nonlinear force below which no warning is given
+_EXPLAINED = 0.3  # of the residual, left with two more degrees: then the degree was too low
+_ROUND_OFF = 1e-9  # residual over linear force below which only round-off is left
+_SMALL = 1e-3  # nonlinear over linear force that a table of six digits cannot resolve
 _ONE_CASE = 0.01  # of the squared residual, left without the inconsistent cases
-_LINEAR = 0.02  # of the linear stiffness, that the load cases may say otherwise
-_ENERGY = 0.01
-_UNIT = 5.0  # times the linear displacement beyond which a unit is wrong
+_LINEAR = 0.02  # permitted deviation of the linear stiffness from the load cases
+_ENERGY = 0.01  # relative, of the strain energy
+_UNIT = 5.0  # times the linear displacement, above which a wrong unit is suspected
 _SHOWN = 4
 
 
 class FitView(NamedTuple):
-    """A fit as the checks look at it; its rows are those of the usable cases."""
+    """A fit for the checks; its rows are those of the usable cases."""
 
     basis: ReductionBasis
     cases: StaticCases  # the usable ones
@@ -49,17 +49,17 @@ def rms(values: np.ndarray | Array) -> float:
 
 
 def case_names(cases: StaticCases, rows: np.ndarray | tuple[int, ...]) -> str:
-    """Load cases as texts name them: their names, or their rows counted from one."""
+    """Load cases in messages: their names, or their rows counted from one."""
     listed = [cases.names[k] if cases.names else f"row {k + 1}" for k in rows]
     more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
     return ", ".join(listed[:_SHOWN]) + more
 
 
 def case_warnings(all_cases: StaticCases, fit: FitView) -> tuple[Fact, ...]:
-    """All that the load cases show against themselves, to be known before the model is used.
+    """Warnings about the load cases, to be read before the model is used.
 
-    Facts on some cases have their rows in `cases`, and names of the first few.
-    Arguments: `all_cases` as they came, those without a solution included.
+    Facts on single cases have their rows in `cases`, and names of the first few.
+    Arguments: `all_cases`, including those without a solution.
     """
     used, failed = np.flatnonzero(all_cases.usable), np.flatnonzero(~all_cases.usable)
 
@@ -67,38 +67,38 @@ def case_warnings(all_cases: StaticCases, fit: FitView) -> tuple[Fact, ...]:
         cases = tuple(int(row) for row in rows)
         return {"cases": cases, "names": case_names(all_cases, cases)}
 
-    found = []
+    warnings = []
     if failed.size:
-        found.append(Fact("not_converged", n_all=len(all_cases.force), **of(failed)))
+        warnings.append(Fact("not_converged", n_all=len(all_cases.force), **of(failed)))
     twice = _repeated(np.asarray(all_cases.force)[used])
     if twice:
-        found.append(Fact("repeated_case", **of(used[list(twice)])))
-    strange = _inconsistent(fit)
-    if strange.size:
-        against, times = _against_the_linear_structure(fit, strange)
-        found.append(
-            Fact("inconsistent_case", against_force=against, times=times, **of(used[strange]))
+        warnings.append(Fact("repeated_case", **of(used[list(twice)])))
+    inconsistent = _inconsistent(fit)
+    if inconsistent.size:
+        against, times = _compared_with_linear(fit, inconsistent)
+        warnings.append(
+            Fact("inconsistent_case", against_force=against, times=times, **of(used[inconsistent]))
         )
     else:
-        found += [*_linear_part(fit), *_sizes(fit)]
-    turned = _softened(fit)
-    if turned.size:
-        found.append(Fact("other_regime", **of(used[turned])))
-    if not np.all(np.isfinite(fit.left_out.held_out)):
-        found.append(Fact("not_checked"))
-    if fit.cases.energy is not None and not strange.size:
+        warnings += [*_linear_part(fit), *_load_scale(fit)]
+    unstable = _softened(fit)
+    if unstable.size:
+        warnings.append(Fact("other_regime", **of(used[unstable])))
+    if not np.all(np.isfinite(fit.left_out.cross_validated)):
+        warnings.append(Fact("not_checked"))
+    if fit.cases.energy is not None and not inconsistent.size:
         error = energy_error(fit.basis, fit.cases, fit.potential)
         off = np.flatnonzero(~(np.abs(error) < _ENERGY))
         if off.size:
             largest = float(np.max(np.abs(error[off])))
-            found.append(Fact("energy", largest=largest, **of(used[off])))
-    return tuple(found)
+            warnings.append(Fact("energy", largest=largest, **of(used[off])))
+    return tuple(warnings)
 
 
 def linear_stiffness_ratio(fit: FitView) -> Float[np.ndarray, " mode"]:
-    """Linear stiffness that the load cases show, over ω²; NaN where they are too few to tell.
+    """Linear stiffness from the load cases, over ω²; NaN if they are too few.
 
-    One where shapes are mass-normalised, units agree and the loads are those that are stated.
+    It is one if shapes are mass-normalised and units and loads are consistent.
     """
     n_cases, n = fit.cases.force.shape
     monomials = monomials_of(n, fit.degree, 1)
@@ -113,7 +113,7 @@ def linear_stiffness_ratio(fit: FitView) -> Float[np.ndarray, " mode"]:
 def energy_error(
     basis: ReductionBasis, cases: StaticCases, potential: PolynomialPotential
 ) -> Float[np.ndarray, " case"]:
-    """Energy of the reduced model less the finite elements', over the latter, for each case."""
+    """Relative error of the reduced model's energy, for each case."""
     q = np.asarray(cases.modal_displacement)
     energy = np.asarray(cases.energy, dtype=float)
     linear = 0.5 * (q**2 @ np.asarray(basis.frequency) ** 2)
@@ -121,65 +121,65 @@ def energy_error(
 
 
 def _repeated(force: Float[np.ndarray, "case mode"]) -> tuple[int, int] | None:
-    """The first two rows with the same load."""
-    size = np.max(np.abs(force), initial=0.0)
+    """Rows of the first two cases with the same load."""
+    largest = np.max(np.abs(force), initial=0.0)
     for k in range(1, len(force)):
-        same = np.flatnonzero(np.all(np.abs(force[:k] - force[k]) <= 1e-9 * size, axis=1))
+        same = np.flatnonzero(np.all(np.abs(force[:k] - force[k]) <= 1e-9 * largest, axis=1))
         if same.size:
             return int(same[0]), k
     return None
 
 
 def _inconsistent(fit: FitView) -> np.ndarray:
-    """The few cases without which the others fit ten times as well; none where there are none.
+    """The few cases without which the others fit ten times as well; empty if there are none.
 
-    Those come first whose displacement is of another size than the others' for their load. Else
-    the worst is removed, the rest fitted again, and so on for up to a fifth of the cases.
+    First those whose compliance is far from that of the others. Otherwise the worst case is
+    removed and the rest refitted, repeatedly for up to a fifth of the cases.
     """
-    size = _linear_size(fit.basis, fit.cases.force, fit.cases.modal_displacement)
-    other = np.abs(np.log(size / np.median(size))) > np.log(_UNIT)
+    compliance = _displacement_ratio(fit.basis, fit.cases.force, fit.cases.modal_displacement)
+    other = np.abs(np.log(compliance / np.median(compliance))) > np.log(_UNIT)
     if other.any():
         return np.flatnonzero(other)
     design, target = np.asarray(fit.system.design), np.asarray(fit.system.target)
     n_cases, n_modes, n_unknowns = design.shape
     start = float(np.sum(fit.left_out.residual**2))
-    keep, nobody = np.arange(n_cases), np.zeros(0, dtype=int)
+    keep, nothing = np.arange(n_cases), np.zeros(0, dtype=int)
     if not fit.misfit > _GOOD or not rms(fit.left_out.residual) > _ROUND_OFF:
-        return nobody
+        return nothing
     for _ in range(max(1, n_cases // 5)):
         if (len(keep) - 1) * n_modes <= n_unknowns:
-            return nobody
+            return nothing
         q, _ = np.linalg.qr(design[keep].reshape(-1, n_unknowns))
         y = target[keep]
         residual = y - (q @ (q.T @ y.reshape(-1))).reshape(y.shape)
         blocks = q.reshape(len(keep), n_modes, n_unknowns)
         rest = (1 + 1e-9) * np.eye(n_modes) - blocks @ blocks.transpose(0, 2, 1)
-        held_out = np.linalg.solve(rest, residual[..., None])[..., 0]
-        gain = np.sum(residual * held_out, axis=1)
+        cross_validated = np.linalg.solve(rest, residual[..., None])[..., 0]
+        gain = np.sum(residual * cross_validated, axis=1)
         worst = int(np.argmax(gain))
         keep = np.delete(keep, worst)
         if np.sum(residual**2) - gain[worst] < _ONE_CASE * start:
             return np.setdiff1d(np.arange(n_cases), keep)
-    return nobody
+    return nothing
 
 
-def _against_the_linear_structure(fit: FitView, rows: np.ndarray) -> tuple[bool, float | None]:
-    """A guess at what is wrong with contradicting cases.
+def _compared_with_linear(fit: FitView, rows: np.ndarray) -> tuple[bool, float | None]:
+    """Probable cause of inconsistent cases.
 
-    Whether all move against their force, and how many times the linear displacement they move where
-    that is far from one.
+    Whether all move against their force, and the ratio to the linear displacement if that is far
+    from one.
     """
     force = np.asarray(fit.cases.force)[rows]
     linear = np.asarray(fit.cases.modal_displacement)[rows] * np.asarray(fit.basis.frequency) ** 2
     if np.all(np.sum(force * linear, axis=1) < 0):
         return True, None
-    ratio = _linear_size(fit.basis, force, fit.cases.modal_displacement[rows])
+    ratio = _displacement_ratio(fit.basis, force, fit.cases.modal_displacement[rows])
     far = np.all(ratio > _UNIT) or np.all(ratio < 1 / _UNIT)
     return False, float(np.median(ratio)) if far else None
 
 
-def _linear_size(basis: ReductionBasis, force: Array, moved: Array) -> np.ndarray:
-    """Size of a displacement over that of the linear structure under the same load, each case."""
+def _displacement_ratio(basis: ReductionBasis, force: Array, moved: Array) -> np.ndarray:
+    """Norm of each displacement over that of the linear structure under the same load."""
     squared = np.asarray(basis.frequency) ** 2
     return np.linalg.norm(np.asarray(moved), axis=1) / np.linalg.norm(force / squared, axis=1)
 
@@ -192,8 +192,8 @@ def _linear_part(fit: FitView) -> list[Fact]:
     return [Fact("linear_part", modes=modes, ratios=ratios)] if off else []
 
 
-def _sizes(fit: FitView) -> list[Fact]:
-    """Whether the cases are too small, or too large for the degree."""
+def _load_scale(fit: FitView) -> list[Fact]:
+    """Whether the loads are too small, or too large for the degree."""
     if fit.misfit < _GOOD:
         return []
     n_cases, n_modes = fit.system.target.shape
@@ -206,9 +206,9 @@ def _sizes(fit: FitView) -> list[Fact]:
     spare = design.shape[0] - design.shape[1]
     if spare > n_modes:
         values = np.linalg.lstsq(design, np.asarray(higher.target).reshape(-1), rcond=1e-12)[0]
-        left = rms(design @ values - np.asarray(higher.target).reshape(-1))
-        left *= np.sqrt(design.shape[0] / spare)
-        longer = bool(left < _EXPLAINED * rms(fit.left_out.residual))
+        residual = rms(design @ values - np.asarray(higher.target).reshape(-1))
+        residual *= np.sqrt(design.shape[0] / spare)
+        longer = bool(residual < _EXPLAINED * rms(fit.left_out.residual))
     else:
         longer = fraction > _SMALL
     if fraction < _SMALL and not longer:

@@ -1,4 +1,4 @@
-"""Implicit condensation: static load cases to a reduced-order model, with its checks."""
+"""Implicit condensation: a reduced-order model from static load cases, with checks."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -34,12 +34,12 @@ from snrmjax.numerics.result import AbstractResult, Variable, setting
 
 
 class FitQuality(eqx.Module):
-    """How well one potential fits the load cases; errors are rms over them.
+    """Quality of the fit of one potential to the load cases; errors are rms over them.
 
     `misfit` and `cross_validated` are of all equations together, over the nonlinear force; those
     of `equation_…` are of each modal equation, over the force on that mode. Cross-validated:
-    every case as the fit to all others has it. NaN within `jit` and derivatives, where nothing can
-    be checked.
+    every case predicted by the fit to all others. NaN within `jit` and derivatives, where nothing
+    is checked.
     """
 
     misfit: float
@@ -48,16 +48,16 @@ class FitQuality(eqx.Module):
     equation_cross_validated: Float[np.ndarray, " mode"]
     case_error: Float[np.ndarray, " case"]  # cross-validated, over the nonlinear force; NaN: unused
     nonlinear_ratio: Float[np.ndarray, " case"]  # nonlinear over linear force
-    linear_stiffness_ratio: Float[np.ndarray, " mode"]  # that the cases show, over ω²
-    condition: float  # of the least-squares problem, columns scaled
+    linear_stiffness_ratio: Float[np.ndarray, " mode"]  # from the cases, over ω²
+    condition: float  # number, of the least-squares problem with scaled columns
     energy_error: Float[np.ndarray, " case"] | None  # relative
 
 
 class Condensation(AbstractResult):
-    """A reduced-order model out of static load cases: ω²q + ∂V/∂q = f, and how good it is.
+    """A reduced-order model from static load cases, ω²q + ∂V/∂q = f, and its quality.
 
-    `potential.coefficient_std` is the jackknife over load cases: how far a coefficient moves with
-    the choice of cases. `warnings` say what a reader should know before the model is used.
+    `potential.coefficient_std` is the jackknife over load cases: the sensitivity of a coefficient
+    to the choice of cases. Read `warnings` before the model is used.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("monomial",)
@@ -70,13 +70,15 @@ class Condensation(AbstractResult):
     degree: int = setting()
 
     def variables(self) -> Mapping[str, Variable]:
-        """The coefficients, one a monomial."""
+        """The coefficients by monomial."""
         keys = np.array([monomial_key(m) for m in self.potential.monomials])
-        at, unit, found = ("monomial",), "kg, m, s", self.potential
+        at, unit, potential = ("monomial",), "kg, m, s", self.potential
         return {
             "monomial": Variable(at, keys, "", "modes of the monomial of V"),
-            "coefficient": Variable(at, found.coefficient, unit, "coefficient of the potential"),
-            "coefficient_std": Variable(at, found.coefficient_std, unit, "1σ over load cases"),
+            "coefficient": Variable(
+                at, potential.coefficient, unit, "coefficient of the potential"
+            ),
+            "coefficient_std": Variable(at, potential.coefficient_std, unit, "1σ over load cases"),
             "misfit": Variable((), self.quality.misfit, "1", "residual over nonlinear force"),
             "cross_validated": Variable(
                 (), self.quality.cross_validated, "1", "the same of cases that were left out"
@@ -97,10 +99,10 @@ class Condensation(AbstractResult):
         mode_of_interest: int = 0,
         name: str = "reduced model",
     ) -> Structure:
-        """The reduced model as a `Structure`, for simulation and for tests of it.
+        """The reduced model as a `Structure`.
 
         Arguments: `damping_ratio` of each mode, or one for all; `sensors` maps a name to the mode
-        shapes there (kg^-1/2, one a mode: rows of `basis.shapes`, or averages of them);
+        shapes there (kg^-1/2, one per mode: rows of `basis.shapes`, or averages of them);
         `participation` Φᵀb per newton of the recorded force; `mode_of_interest` from zero.
         Raises `ValueError` as `linear_modes` does.
         """
@@ -121,12 +123,12 @@ def reduced_model(basis: ReductionBasis, cases: StaticCases, *, degree: int = 3)
     """Fit one potential V to static load cases, f = ω²q + ∂V/∂q, and check both.
 
     Arguments: `degree` of the nonlinear force (3: quadratic and cubic), up to 7.
-    Returns the model with residuals, condition, cross-validated error and warnings. Within
-    `jax.jit` and derivatives it is the same fit without checks, with coefficients of NaN where a
-    load case did not converge. Raises
-    `ValueError` where the cases are too few or do not determine every coefficient, naming some.
-    Validity: amplitudes up to those of the load cases; motions outside the modes kept must follow
-    them statically (their frequencies lie well above the response's harmonics).
+    Returns the model with residuals, condition number, cross-validated error and warnings. Within
+    `jax.jit` and derivatives it is the same fit without checks, with coefficients of NaN if a load
+    case did not converge. Raises `ValueError` if the cases are too few or do not determine every
+    coefficient, naming some.
+    Validity: amplitudes up to those of the load cases; motions outside the kept modes must follow
+    them statically (natural frequencies well above the response's harmonics).
     Reference: Hollkamp & Gordon, J. Sound Vib. 318 (2008) 1139, doi:10.1016/j.jsv.2008.04.035.
 
     >>> basis = ReductionBasis(np.array([2.0]), np.eye(1), np.eye(1), (1,))
@@ -152,16 +154,16 @@ def reduced_model(basis: ReductionBasis, cases: StaticCases, *, degree: int = 3)
     solved: StaticCases = jax.tree.map(lambda values: np.asarray(values)[used], arrays)
     monomials = monomials_of(n_modes, degree)
     for what, rows in (("force", solved.force), ("modal displacement", solved.modal_displacement)):
-        still = np.flatnonzero(~np.any(np.asarray(rows) != 0, axis=0))
-        if still.size:
+        zero_modes = np.flatnonzero(~np.any(np.asarray(rows) != 0, axis=0))
+        if zero_modes.size:
             raise ValueError(
-                f"the {what} of mode {basis.numbers[still[0]]} is zero in every load case."
+                f"the {what} of mode {basis.numbers[zero_modes[0]]} is zero in every load case."
             )
     system = fit_system(basis, solved, monomials)
     require_determined(system, monomials, used.size)
     left_out = leave_out(system)
     spread = jnp.asarray(left_out.std * np.asarray(system.column_scale))
-    # A standard deviation that is not known is written as none.
+    # An unknown standard deviation is stored as zero.
     spread = jnp.where(jnp.isfinite(spread), spread, 0.0)
     potential = dataclasses.replace(
         fit_potential(basis, solved, degree=degree), coefficient_std=spread
@@ -178,40 +180,40 @@ def reduced_model(basis: ReductionBasis, cases: StaticCases, *, degree: int = 3)
 
 
 def _unchecked(basis: ReductionBasis, cases: StaticCases, degree: int) -> Condensation:
-    """The fit alone, of numbers that are not known yet."""
-    found = fit_potential(basis, cases, degree=degree)
-    whole = jnp.where(jnp.all(cases.converged), found.coefficient, jnp.nan)
-    potential = dataclasses.replace(found, coefficient=whole)
+    """The fit alone, for traced numbers."""
+    fitted = fit_potential(basis, cases, degree=degree)
+    coefficient = jnp.where(jnp.all(cases.converged), fitted.coefficient, jnp.nan)
+    potential = dataclasses.replace(fitted, coefficient=coefficient)
     by_mode, by_case = (np.full(size, np.nan) for size in cases.force.shape[::-1])
-    nothing = FitQuality(
+    no_quality = FitQuality(
         *(np.nan, np.nan, by_mode, by_mode, by_case, by_case, by_mode, np.nan), energy_error=None
     )
-    return Condensation(basis, cases, potential, nothing, (), degree)
+    return Condensation(basis, cases, potential, no_quality, (), degree)
 
 
 def _quality(fit: FitView, used: np.ndarray, n_cases: int) -> FitQuality:
     target, left_out = np.asarray(fit.system.target), fit.left_out
     force = np.asarray(fit.cases.force) / np.asarray(fit.system.row_scale)
     linear = np.linalg.norm(force - target, axis=1)
-    size = np.sqrt(np.mean(force**2, axis=0))
+    force_rms = np.sqrt(np.mean(force**2, axis=0))
 
     def by_case(values: np.ndarray) -> np.ndarray:
         rows = np.full(n_cases, np.nan)
         rows[used] = values
         return rows
 
-    known = np.all(np.isfinite(left_out.held_out))
-    held_out = left_out.held_out if known else np.full(target.shape, np.nan)
+    known = np.all(np.isfinite(left_out.cross_validated))
+    cross_validated = left_out.cross_validated if known else np.full(target.shape, np.nan)
     nonlinear = np.linalg.norm(target, axis=1)
     energy = None
     if fit.cases.energy is not None:
         energy = by_case(energy_error(fit.basis, fit.cases, fit.potential))
     return FitQuality(
         misfit=fit.misfit,
-        cross_validated=rms(held_out) / rms(target),
-        equation_residual=np.sqrt(np.mean(left_out.residual**2, axis=0)) / size,
-        equation_cross_validated=np.sqrt(np.mean(held_out**2, axis=0)) / size,
-        case_error=by_case(np.linalg.norm(left_out.held_out, axis=1) / nonlinear),
+        cross_validated=rms(cross_validated) / rms(target),
+        equation_residual=np.sqrt(np.mean(left_out.residual**2, axis=0)) / force_rms,
+        equation_cross_validated=np.sqrt(np.mean(cross_validated**2, axis=0)) / force_rms,
+        case_error=by_case(np.linalg.norm(left_out.cross_validated, axis=1) / nonlinear),
         nonlinear_ratio=by_case(nonlinear / linear),
         linear_stiffness_ratio=linear_stiffness_ratio(fit),
         condition=left_out.condition,

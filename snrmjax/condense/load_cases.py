@@ -1,4 +1,4 @@
-"""What a condensation starts from: linear modes to keep, and static load cases run with them."""
+"""Input of a condensation: the linear modes to keep, and static load cases in these modes."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,12 +9,11 @@ from jaxtyping import Array, Bool, Float
 class ReductionBasis(eqx.Module):
     """The linear modes that a reduced model keeps, of a model with mass M and stiffness K.
 
-    `shapes` are mass-normalised (ΦᵀMΦ = I, kg^-1/2). `filter` turns displacements into modal
-    coordinates, q = filter @ u: it is ΦᵀM where the mass matrix is known, else the pseudo-inverse
-    of the shapes at the degrees of freedom that were written. `numbers` are the modes' numbers in
-    the finite-element model, counted from one, for texts and tables. `translations` marks the
-    rows that are translations (m), where others are rotations (rad): a wanted displacement is one
-    of those. None: all are.
+    `shapes` are mass-normalised (ΦᵀMΦ = I, kg^-1/2). `filter` is the modal filter, q = filter @ u:
+    ΦᵀM if the mass matrix is known, otherwise the pseudo-inverse of the shapes at the exported
+    degrees of freedom. `numbers` are the mode numbers in the finite-element model, counted from
+    one, for texts and tables. `translations` marks the rows that are translations (m) rather than
+    rotations (rad), to which load scales refer. None: all are.
     """
 
     frequency: Float[Array, " mode"]  # rad/s
@@ -26,19 +25,19 @@ class ReductionBasis(eqx.Module):
     @property
     def largest(self) -> Float[Array, " mode"]:
         """Largest translation of each shape, kg^-1/2: metres per unit of modal displacement."""
-        size = jnp.abs(self.shapes)
+        magnitude = jnp.abs(self.shapes)
         if self.translations is not None:
-            size = jnp.where(jnp.asarray(self.translations)[:, None], size, 0.0)
-        return jnp.max(size, axis=0)
+            magnitude = jnp.where(jnp.asarray(self.translations)[:, None], magnitude, 0.0)
+        return jnp.max(magnitude, axis=0)
 
 
 class StaticCases(eqx.Module):
-    """Static solutions under modal loads, however they were computed; one row a case.
+    """Static solutions under modal loads, from any solver; one row per case.
 
     Case c has the external force F = M Φ f_c, so that ΦᵀF = f_c; its displacement u_c is
-    q_c = filter @ u_c in modal coordinates. Rows that did not converge are kept, marked, and
-    left out of fits. `energy` is the strain energy (J) where the finite-element code gave it:
-    a free check of the potential; `displacement` u where it is known.
+    q_c = filter @ u_c in modal coordinates. Cases that did not converge are marked and excluded
+    from fits. `energy` is the strain energy (J) if the finite-element code exports it, an
+    independent check of the potential; `displacement` is u if known.
     """
 
     force: Float[Array, "case mode"]  # f, kg^1/2 m/s²
@@ -49,7 +48,7 @@ class StaticCases(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True, default=())  # as the user named them
 
     def __check_init__(self) -> None:
-        """Raises `ValueError` where numbers of rows or modes do not fit together."""
+        """Raises `ValueError` for inconsistent numbers of rows or modes."""
         if self.force.shape != self.modal_displacement.shape:
             raise ValueError(
                 f"`force` has the shape {self.force.shape}, `modal_displacement` "
@@ -65,6 +64,6 @@ class StaticCases(eqx.Module):
 
     @property
     def usable(self) -> np.ndarray:
-        """Whether a case converged to finite numbers, one for each."""
+        """Whether each case converged to finite numbers."""
         rows = np.concatenate([self.force, self.modal_displacement], axis=1)
         return np.asarray(self.converged) & np.isfinite(rows).all(axis=1)

@@ -1,4 +1,4 @@
-"""Sets of static load cases: forces along combinations of modes, and how large they are."""
+"""Sets of static load cases: combinations of modal forces and their scale."""
 
 import itertools
 import math
@@ -14,19 +14,19 @@ from snrmjax.condense.potential_fit import check_degree
 from snrmjax.model.modes import have_values
 
 NONLINEAR_RATIO = 0.02
-"""Default size of a load: there, the nonlinear part of the force is 2 % of the linear one.
+"""Default load scale: the nonlinear part of the force is 2 % of the linear one.
 
-It is then far above the round-off of any code (a table of six digits still gives it to 5e-5), and
-the terms that the polynomial leaves out stay small against those that it has: on six structures
-(benchmarks/rom_load_scale.py) the coefficients are the same to 2 % for loads up to 1.8 to 5.6
-times as large and down to a hundredth and less.
+It is then far above the round-off of any code (a table of six digits still resolves it to 5e-5),
+and truncated terms of the polynomial are small: for six structures (benchmarks/rom_load_scale.py)
+the coefficients change by less than 2 % for loads up to 1.8 to 5.6 times as large and down to a
+hundredth and less.
 """
 
 StaticSolver = Callable[[Float[np.ndarray, "case mode"]], StaticCases]
-"""Runs static load cases, given their modal forces (kg^1/2 m/s²), one row a case."""
+"""Solves static load cases for modal forces (kg^1/2 m/s²), one row per case."""
 
-_ROUNDS, _CLOSE = 12, 0.15  # of the search for a ratio, and how near it ends
-_FURTHEST = 30.0  # times by which one step of the search changes a displacement at most
+_ROUNDS, _CLOSE = 12, 0.15  # iterations of the search for a ratio, and its tolerance
+_FURTHEST = 30.0  # largest factor on a displacement in one iteration
 
 
 class LoadSet(NamedTuple):
@@ -46,15 +46,15 @@ def modal_loads(
 ) -> LoadSet:
     """Forces along single modes, pairs, triples, … of them, with all combinations of signs.
 
-    A mode loaded alone gets the force that moves the linear structure by the wanted displacement d
-    where the mode shape is largest: f_r = ω_r² d_r / max|φ_r|. In a combination of k modes each
-    gets a k-th of that, so that all cases move the structure about as far.
+    A single mode gets the force that moves the linear structure by the displacement d at the
+    maximum of the mode shape: f_r = ω_r² d_r / max|φ_r|. In a combination of k modes each gets a
+    k-th of that, so that all cases have displacements of similar magnitude.
 
-    Arguments: `displacement` in m, one for all modes or one for each; `degree` of the force that
-    is to be fitted, which sets how many modes are combined (as many, since q₁q₂q₃ is only seen
-    where three modes move) and how many load levels there are; `most_modes` and `levels`
-    (fractions of the displacement) say it otherwise. Differentiable by `basis` and `displacement`.
-    Raises `ValueError` for a displacement, number of modes or level that makes no load.
+    Arguments: `displacement` in m, one for all modes or one for each; `degree` of the force to be
+    fitted, which sets how many modes are combined (as many, since q₁q₂q₃ needs three modes in
+    motion) and the number of load levels; `most_modes` and `levels` (fractions of the
+    displacement) override them. Differentiable by `basis` and `displacement`.
+    Raises `ValueError` for a displacement, number of modes or level that is not positive.
     Reference: Kuether, Deaner, Hollkamp & Allen, AIAA J. 53 (2015) 3273, doi:10.2514/1.J053838
     (constant modal displacement).
 
@@ -94,8 +94,8 @@ def modal_loads(
 def default_levels(n_modes: int, degree: int) -> tuple[float, ...]:
     """Fractions of the full load at which each combination is run.
 
-    One level for every two degrees of the force, since cases of both signs tell even from odd
-    terms; one more where one or two modes leave nothing over to check the fit with.
+    One level for every two degrees of the force, since cases of both signs separate even from odd
+    terms; one more with one or two modes, for redundancy to check the fit.
 
     >>> default_levels(4, 3), default_levels(1, 3)
     ((1.0,), (0.5, 1.0))
@@ -113,41 +113,41 @@ def displacement_for_ratio(
 ) -> Float[np.ndarray, " mode"]:
     """The displacement of each mode alone at which nonlinear over linear force reaches a ratio.
 
-    The ratio is that of the forces f − ω²q and ω²q, each mode's divided by ω: its square compares
-    energies, and what loading one mode does to the others counts. It is the larger one of both
-    signs. The search goes by powers of the displacement: each round runs two load cases for every
-    mode.
+    The ratio is that of the forces f − ω²q and ω²q, with each mode divided by ω, so that its square
+    compares energies and the reaction on other modes is included. It is the larger one of both
+    signs. The search assumes a power law in the displacement: each iteration runs two load cases
+    for every mode.
 
-    Arguments: `start` a displacement in m where to begin, such as the thickness.
-    Returns displacements in m for `modal_loads`. Raises `ValueError` where a mode does not reach
-    the ratio, such as in a linear structure, or where its load cases do not converge.
+    Arguments: `start` an initial displacement in m, such as the thickness.
+    Returns displacements in m for `modal_loads`. Raises `ValueError` if a mode does not reach
+    the ratio, such as in a linear structure, or if its load cases do not converge.
     """
     n = len(basis.numbers)
     if not 0 < ratio < 1:
         raise ValueError(f"`ratio` must lie between 0 and 1, but is {ratio}.")
-    size = np.broadcast_to(np.asarray(start, dtype=float), (n,)).copy()
-    before = (size, np.full(n, np.nan))
-    low, high = np.zeros(n), np.full(n, np.inf)  # displacements known to be too small, too large
+    amplitude = np.broadcast_to(np.asarray(start, dtype=float), (n,)).copy()
+    before = (amplitude, np.full(n, np.nan))
+    low, high = np.zeros(n), np.full(n, np.inf)  # brackets of the displacement
     for _ in range(_ROUNDS):
-        found = _nonlinear_ratio(basis, solve, size)
-        close = np.abs(np.log(found / ratio)) < _CLOSE
+        current = _nonlinear_ratio(basis, solve, amplitude)
+        close = np.abs(np.log(current / ratio)) < _CLOSE
         if np.all(close):
-            return size
-        low = np.where(found < ratio, np.fmax(low, size), low)
-        high = np.where(found >= ratio, np.fmin(high, size), high)
-        power = _power(before, (size, found))
-        before = (size, found)
-        step = np.where(np.isfinite(found), (ratio / np.fmin(found, 1e300)) ** (1 / power), 0.2)
-        new = size * np.clip(step, 1 / _FURTHEST, _FURTHEST)
+            return amplitude
+        low = np.where(current < ratio, np.fmax(low, amplitude), low)
+        high = np.where(current >= ratio, np.fmin(high, amplitude), high)
+        power = _power(before, (amplitude, current))
+        before = (amplitude, current)
+        step = np.where(np.isfinite(current), (ratio / np.fmin(current, 1e300)) ** (1 / power), 0.2)
+        new = amplitude * np.clip(step, 1 / _FURTHEST, _FURTHEST)
         outside = (low > 0) & np.isfinite(high) & ((new <= low) | (new >= high))
         new = np.where(outside, np.sqrt(low * np.where(outside, high, 1.0)), new)
-        size = np.where(close, size, new)
-    worst = int(np.argmax(np.abs(np.log(found / ratio))))
-    last = f"{before[0][worst]:.3g} m are wanted"
-    if np.isinf(found[worst]):
-        why = f"the load cases where {last} have no solution"
+        amplitude = np.where(close, amplitude, new)
+    worst = int(np.argmax(np.abs(np.log(current / ratio))))
+    last = f"{before[0][worst]:.3g} m"
+    if np.isinf(current[worst]):
+        why = f"the load cases at {last} have no solution"
     else:
-        why = f"it is {found[worst]:.3g} where {last}"
+        why = f"it is {current[worst]:.3g} at {last}"
     raise ValueError(
         f"no load along mode {basis.numbers[worst]} has a nonlinear force of {ratio:g} times the "
         f"linear one ({why}): state the load scale."
@@ -155,18 +155,18 @@ def displacement_for_ratio(
 
 
 def _nonlinear_ratio(
-    basis: ReductionBasis, solve: StaticSolver, size: Float[np.ndarray, " mode"]
+    basis: ReductionBasis, solve: StaticSolver, amplitude: Float[np.ndarray, " mode"]
 ) -> Float[np.ndarray, " mode"]:
     """|f − ω²q|/|ω²q| of each mode alone, the larger of both signs; infinite if not solved."""
     frequency = np.asarray(basis.frequency)
-    alone = np.diag(frequency**2 * size / np.asarray(basis.largest))
+    alone = np.diag(frequency**2 * amplitude / np.asarray(basis.largest))
     cases = solve(np.concatenate([alone, -alone]))
     linear = np.asarray(cases.modal_displacement) * frequency
     rest = np.linalg.norm(np.asarray(cases.force) / frequency - linear, axis=1)
     whole = np.linalg.norm(linear, axis=1)
     good = cases.usable & (whole > 0)
-    ratio = np.where(good, rest / np.where(good, whole, 1.0), np.inf).reshape(2, size.size)
-    # A structure without any nonlinear force has the ratio of one rounding.
+    ratio = np.where(good, rest / np.where(good, whole, 1.0), np.inf).reshape(2, amplitude.size)
+    # A linear structure has a ratio of the order of rounding.
     return np.fmax(ratio.max(axis=0), np.finfo(float).eps)
 
 

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.model.potential import Monomial, PolynomialPotential, monomial_key
 
-_NOT_SEEN = 1e-7  # of a unit column: a monomial that no load case moves
-_SINGULAR = 1e11  # condition of the scaled columns from which on coefficients are arbitrary
+_NOT_EXCITED = 1e-7  # of a unit column: a monomial that no load case excites
+_SINGULAR = 1e11  # condition number of the scaled columns above which coefficients are arbitrary
 
 
 class FitSystem(NamedTuple):
@@ -53,7 +53,7 @@ def check_degree(degree: int) -> None:
 def fit_system(
     basis: ReductionBasis, cases: StaticCases, monomials: tuple[Monomial, ...]
 ) -> FitSystem:
-    """The scaled equations of the fit; rows of cases that are not usable are zero."""
+    """The scaled equations of the fit; rows of unusable cases are zero."""
     xp = _namespace(basis, cases)
     force, moved = xp.asarray(cases.force), xp.asarray(cases.modal_displacement)
     finite = xp.isfinite(xp.concatenate([force, moved], axis=1)).all(axis=1)
@@ -63,19 +63,19 @@ def fit_system(
     typical = xp.sqrt(xp.sum(q**2, axis=0) / xp.sum(used))
     row_scale = stiffness * typical
     n_modes = q.shape[1]
-    place = np.array([[m.count(i) for i in range(n_modes)] for m in monomials])
-    column_scale = xp.mean(row_scale * typical) / xp.prod(typical**place, axis=1)
+    exponent = np.array([[m.count(i) for i in range(n_modes)] for m in monomials])
+    column_scale = xp.mean(row_scale * typical) / xp.prod(typical**exponent, axis=1)
     # ∂/∂q_m of monomial k is n_km times the product of the others: powers of scaled q.
     scaled = q / xp.where(typical > 0, typical, 1.0)
     powers = [xp.ones_like(scaled)]
-    for _ in range(int(place.max())):
+    for _ in range(int(exponent.max())):
         powers.append(powers[-1] * scaled)
     of_power = xp.stack(powers, axis=-1)  # case, mode, power
     columns = []
     for m in range(n_modes):
-        left = np.maximum(place - (np.arange(n_modes) == m), 0)
-        product = xp.prod(of_power[:, np.arange(n_modes), left], axis=-1)  # case, monomial
-        columns.append(product * place[:, m])
+        remaining = np.maximum(exponent - (np.arange(n_modes) == m), 0)
+        product = xp.prod(of_power[:, np.arange(n_modes), remaining], axis=-1)  # case, monomial
+        columns.append(product * exponent[:, m])
     # Scaled so that each modal equation is divided by its `row_scale`.
     per_mode = xp.mean(row_scale * typical) / (row_scale * typical)
     design = xp.stack(columns, axis=1) * per_mode[:, None]
@@ -87,14 +87,14 @@ def fit_potential(
 ) -> PolynomialPotential:
     """The potential V whose gradient fits f = ω²q + ∂V/∂q best, in all equations at once.
 
-    Each coefficient of V enters several equations; fitted at once they cannot contradict each
-    other, as coefficients fitted equation by equation do. Equations are weighted by one over the
-    typical linear force ω²q of their mode. Solved by a QR decomposition; `jit`, `vmap` and
-    gradients by everything in `basis` and `cases` are exact, and without checks: see `condense`.
+    Each coefficient of V enters several equations; a common fit keeps them consistent (the force
+    is conservative), unlike a fit equation by equation. Equations are weighted by one over the
+    typical linear force ω²q of their mode. Solved by a QR decomposition; compatible with `jit` and
+    `vmap`, with exact gradients by `basis` and `cases`, and without checks: see `reduced_model`.
 
     Arguments: `degree` of the force, from 2 to 7.
-    Returns the potential, without standard deviations. Cases that did not converge are left out;
-    NaN where the cases determine no potential.
+    Returns the potential, without standard deviations. Cases that did not converge are excluded;
+    NaN if the cases do not determine the potential.
     Reference: Hollkamp & Gordon, J. Sound Vib. 318 (2008) 1139, doi:10.1016/j.jsv.2008.04.035.
     """
     check_degree(degree)
@@ -106,28 +106,28 @@ def fit_potential(
 
 
 def solve_scaled(system: FitSystem) -> Float[Array, " monomial"]:
-    """The scaled coefficients of a fit system; NaN where it determines none."""
+    """The scaled coefficients of a fit system; NaN if it is singular."""
     rows, target = system.design.reshape(-1, system.design.shape[-1]), system.target.reshape(-1)
     if rows.shape[0] < rows.shape[1]:
         return jnp.full(rows.shape[1], jnp.nan)
     if isinstance(rows, np.ndarray):
         basis, triangle = np.linalg.qr(rows)
         return jnp.asarray(np.linalg.solve(triangle, basis.T @ target))
-    found = lx.linear_solve(lx.MatrixLinearOperator(rows), target, lx.QR(), throw=False)
-    return jnp.where(found.result == lx.RESULTS.successful, found.value, jnp.nan)
+    solution = lx.linear_solve(lx.MatrixLinearOperator(rows), target, lx.QR(), throw=False)
+    return jnp.where(solution.result == lx.RESULTS.successful, solution.value, jnp.nan)
 
 
 def _namespace(*trees: object) -> Any:
-    """NumPy where everything has values: nothing is compiled then. JAX within `jit`, `grad`."""
+    """NumPy for concrete values, so that nothing is compiled; JAX within `jit` and `grad`."""
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
     return jnp if traced else np
 
 
 class LeftOutCases(NamedTuple):
-    """What leaving out one load case after the other says, without fitting again."""
+    """Leave-one-case-out residuals and jackknife errors, without refitting."""
 
-    residual: Float[np.ndarray, "case mode"]  # of the fit to all, scaled rows
-    held_out: Float[np.ndarray, "case mode"]  # of each case, of the fit to the others
+    residual: Float[np.ndarray, "case mode"]  # of the fit to all cases, scaled rows
+    cross_validated: Float[np.ndarray, "case mode"]  # of each case, for the fit to the others
     std: Float[np.ndarray, " monomial"]  # jackknife 1σ of the scaled coefficients
     condition: float
 
@@ -135,9 +135,9 @@ class LeftOutCases(NamedTuple):
 def leave_out(system: FitSystem) -> LeftOutCases:
     """Leave out each case in turn, in closed form from one decomposition.
 
-    With H = QQᵀ of the design the held-out residual of case c is (I − H_cc)⁻¹ r_c. A case without
-    which the others determine no potential has an infinite held-out residual. Coefficients'
-    standard deviations are those of the jackknife over cases.
+    With H = QQᵀ of the design the leave-one-out residual of case c is (I − H_cc)⁻¹ r_c. It is
+    infinite for a case without which the others do not determine the potential. Standard
+    deviations of the coefficients are those of the jackknife over cases.
     Reference: B. Efron & R. J. Tibshirani, An Introduction to the Bootstrap (1993), ch. 11,
     doi:10.1201/9780429246593.
     """
@@ -149,22 +149,22 @@ def leave_out(system: FitSystem) -> LeftOutCases:
     residual = target - design @ values
     blocks = basis.reshape(n_cases, n_modes, n_unknowns)
     rest = np.eye(n_modes) - blocks @ blocks.transpose(0, 2, 1)
-    alone = np.linalg.eigvalsh(rest)[:, 0] < 1e-9
-    rest[alone] = np.eye(n_modes)
-    held_out = np.linalg.solve(rest, residual[..., None])[..., 0]
-    shift = np.linalg.solve(triangle, np.einsum("cmk,cm->kc", blocks, held_out)).T
+    indispensable = np.linalg.eigvalsh(rest)[:, 0] < 1e-9
+    rest[indispensable] = np.eye(n_modes)
+    cross_validated = np.linalg.solve(rest, residual[..., None])[..., 0]
+    shift = np.linalg.solve(triangle, np.einsum("cmk,cm->kc", blocks, cross_validated)).T
     std = np.sqrt((n_cases - 1) / n_cases * np.sum((shift - shift.mean(axis=0)) ** 2, axis=0))
-    held_out[alone] = np.inf
+    cross_validated[indispensable] = np.inf
     return LeftOutCases(
         residual,
-        held_out,
-        np.full(n_unknowns, np.nan) if alone.any() else std,
+        cross_validated,
+        np.full(n_unknowns, np.nan) if indispensable.any() else std,
         float(np.linalg.cond(triangle)),
     )
 
 
 def require_determined(system: FitSystem, monomials: tuple[Monomial, ...], n_used: int) -> None:
-    """Raises `ValueError` where the cases cannot determine every coefficient, naming some."""
+    """Raises `ValueError` if the cases do not determine every coefficient, naming some."""
     rows = np.asarray(system.design).reshape(-1, len(monomials))
     equations = n_used * system.design.shape[1]
     if equations < len(monomials):
@@ -172,18 +172,20 @@ def require_determined(system: FitSystem, monomials: tuple[Monomial, ...], n_use
             f"{n_used} usable load cases give {equations} equations for {len(monomials)} "
             "coefficients: more load cases, or a lower degree, are needed."
         )
-    size = np.linalg.norm(rows, axis=0) / np.sqrt(max(n_used, 1))
-    unseen = [monomial_key(m) for m, s in zip(monomials, size, strict=True) if not s > _NOT_SEEN]
-    if not unseen:
+    norm = np.linalg.norm(rows, axis=0) / np.sqrt(max(n_used, 1))
+    undetermined = [
+        monomial_key(m) for m, s in zip(monomials, norm, strict=True) if not s > _NOT_EXCITED
+    ]
+    if not undetermined:
         values, directions = np.linalg.svd(rows / np.linalg.norm(rows, axis=0))[1:]
         if values[0] < _SINGULAR * values[-1]:
             return
         fraction = np.abs(directions[-1])
-        unseen = [
+        undetermined = [
             monomial_key(monomials[k]) for k in np.flatnonzero(fraction > 0.3 * fraction.max())
         ]
-    names = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
+    names = ", ".join(undetermined[:6]) + (", …" if len(undetermined) > 6 else "")
     raise ValueError(
-        f"the load cases do not tell these coefficients apart: {names} (mode numbers of the "
+        f"the load cases do not determine these coefficients separately: {names} (modes of the "
         "reduced model); combine more modes, add load levels, or lower the degree."
     )

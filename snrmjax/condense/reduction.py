@@ -1,4 +1,4 @@
-"""What a reduced-order model is made from, wherever it comes from."""
+"""The source of a reduced-order model: modes, load cases or their solver, and metadata."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -16,11 +16,11 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 
 ASSUMED_DAMPING = 0.01
-"""Damping ratio of a mode of which nobody stated one: no finite-element model has it."""
+"""Default damping ratio of a mode, which a finite-element model does not have."""
 
 
 class ShapeLines(NamedTuple):
-    """Mode shapes along a structure, to be drawn."""
+    """Mode shapes along a structure, for plots."""
 
     position: Float[np.ndarray | Array, " point"]  # m along the structure
     shape: Float[np.ndarray | Array, "point mode"]  # transverse, kg^-1/2
@@ -28,9 +28,9 @@ class ShapeLines(NamedTuple):
 
 
 class ReductionSource(NamedTuple):
-    """Modes to keep, load cases or what runs them, and what else a model needs.
+    """Modes to keep, load cases or their solver, and further data of a model.
 
-    `cases` are load cases that were run already; where they are None `solve` runs any.
+    `cases` are available load cases; if None, `solve` runs them.
     """
 
     name: str
@@ -41,14 +41,14 @@ class ReductionSource(NamedTuple):
     cases: StaticCases | None = None
     solve: StaticSolver | None = None
     thickness: float | None = None  # m, the unit of `load_scale`
-    load_scale: float | None = None  # thicknesses that single modes move linearly
+    load_scale: float | None = None  # linear displacement of single modes, thicknesses
     degree: int = 3
     scales: tuple[float, ...] = SCALES  # of the study over load scale
     lines: ShapeLines | None = None
     notes: tuple[Fact, ...] = ()
 
     def structure(self, condensation: Condensation) -> Structure:
-        """The reduced model as a structure that a model file can hold."""
+        """The reduced model as a structure, for a model file."""
         return condensation.structure(
             self.damping_ratio,
             sensors=self.sensors,
@@ -60,14 +60,14 @@ class ReductionSource(NamedTuple):
 def run_load_cases(
     source: ReductionSource, displacement: Float[np.ndarray | Array, " mode"] | None = None
 ) -> tuple[Any, StaticCases]:
-    """Run the load cases of a displacement, of the stated load scale, or of the default one.
+    """Run the load cases for a displacement, the given load scale, or the default one.
 
-    Arguments: `displacement` in m, that the loads of single modes would cause in the linear
-    structure. Returns it, and the cases. Raises `ValueError` where nothing can run them and as
+    Arguments: `displacement` in m of the linear structure under the loads of single modes.
+    Returns it, and the cases. Raises `ValueError` without a solver and as
     `displacement_for_ratio` does.
     """
     if source.solve is None:
-        raise ValueError(f"{source.name} has neither load cases nor a way to run them.")
+        raise ValueError(f"{source.name} has neither load cases nor a solver for them.")
     n = len(source.basis.numbers)
     if displacement is None and source.load_scale is not None:
         displacement = np.full(n, source.load_scale * (source.thickness or 1.0))

@@ -1,4 +1,4 @@
-"""How the coefficients of a reduced-order model depend on the size of its load cases."""
+"""Sensitivity of a reduced-order model's coefficients to the scale of its load cases."""
 
 from collections.abc import Callable, Mapping
 from typing import ClassVar
@@ -18,15 +18,15 @@ SCALES = tuple(float(scale) for scale in np.logspace(-2.0, 0.75, 12))
 """Default multiples of the displacement: two decades below and three quarters of one above."""
 
 TOLERANCE = 0.02
-"""By this share the leading coefficients may differ within a plateau."""
+"""Permitted relative spread of the leading coefficients within a plateau."""
 
-_LEADING = 0.1  # of the largest term's force: a coefficient that the plateau is judged by
+_LEADING = 0.1  # of the largest term's force, for a coefficient to count in the plateau
 
 
 class LoadScaleStudy(AbstractResult):
-    """Coefficients against the size of the load cases, and where they do not depend on it.
+    """Coefficients over load scale, and the range in which they do not depend on it.
 
-    Too small loads leave round-off, too large ones the terms that the polynomial does not have.
+    Too small loads are dominated by round-off, too large ones by truncated terms.
     `plateau` is the longest range of scales over which every leading coefficient stays within
     `TOLERANCE`; leading are those whose term has at least a tenth of the force of the largest term
     of its degree at scale 1. None: there is no plateau of two scales.
@@ -37,7 +37,7 @@ class LoadScaleStudy(AbstractResult):
     leading: tuple[bool, ...] = eqx.field(static=True)
     monomials: tuple[Monomial, ...] = eqx.field(static=True)
     scale: Float[np.ndarray, " scale"] = quantity(
-        "load_scale", "1", "times the displacement that was asked for", name="load_scale"
+        "load_scale", "1", "multiple of the nominal displacement", name="load_scale"
     )
     # NaN where load cases failed.
     coefficient: Float[np.ndarray, "scale monomial"] = quantity(
@@ -53,7 +53,7 @@ class LoadScaleStudy(AbstractResult):
 
     @property
     def decades(self) -> float:
-        """Width of the plateau in powers of ten; 0 where there is none."""
+        """Width of the plateau in powers of ten; 0 if there is none."""
         return 0.0 if self.plateau is None else float(np.log10(self.plateau[1] / self.plateau[0]))
 
     @property
@@ -64,7 +64,7 @@ class LoadScaleStudy(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """Range of scales and plateau."""
         solved = int(np.isfinite(self.misfit).sum())
-        first = f"LoadScaleStudy: {len(self.scale)} load scales, {solved} with a whole fit"
+        first = f"LoadScaleStudy: {len(self.scale)} load scales, {solved} with all cases solved"
         if self.plateau is None:
             return first, "no plateau"
         low, high = self.plateau
@@ -90,16 +90,16 @@ def load_scale_study(
     scales: tuple[float, ...] = SCALES,
     report: Callable[[int, int], None] | None = None,
 ) -> LoadScaleStudy:
-    """Condense with loads of many sizes.
+    """Condense with loads of several scales.
 
-    Arguments: `displacement` in m, as for `modal_loads`; `scales` rising multiples of it, 1 among
-    or between them; `report` is told how many scales of how many are done.
+    Arguments: `displacement` in m, as for `modal_loads`; `scales` ascending multiples of it, 1
+    among or between them; `report` is called with the numbers of finished and of all scales.
     Returns coefficients over scale and the plateau. A scale whose load cases do not all converge
-    has NaN and ends a plateau. Raises `ValueError` for scales that do not rise.
+    has NaN and ends a plateau. Raises `ValueError` for scales that do not ascend.
     """
     scale = np.asarray(scales, dtype=float)
     if scale.ndim != 1 or scale.size < 2 or not np.all(np.diff(scale) > 0) or not scale[0] > 0:
-        raise ValueError(f"`scales` must be positive and rise, at least two, but is {scales}.")
+        raise ValueError(f"`scales` must be positive and ascending, at least two, but is {scales}.")
     monomials = monomials_of(len(basis.numbers), degree)
     coefficient = np.full((scale.size, len(monomials)), np.nan)
     misfit, ratio = np.full(scale.size, np.nan), np.full(scale.size, np.nan)
@@ -162,7 +162,7 @@ def _fitted(
 
 
 def typical_displacement(cases: StaticCases) -> Float[np.ndarray, " mode"]:
-    """Modal displacements, rms over the load cases that were solved."""
+    """Modal displacements, rms over the converged load cases."""
     moved = np.asarray(cases.modal_displacement)[cases.usable]
     return np.sqrt(np.mean(moved**2, axis=0)) if len(moved) else np.ones(moved.shape[1])
 
@@ -172,10 +172,10 @@ def leading_terms(
     typical: Float[np.ndarray, " mode"],
     monomials: tuple[Monomial, ...],
 ) -> Bool[np.ndarray, " monomial"]:
-    """The coefficients whose terms have a tenth of the energy of the largest of their degree."""
-    size = np.array([np.prod(typical[list(m)]) for m in monomials]) * np.abs(coefficient)
+    """Coefficients whose terms have a tenth of the energy of the largest of their degree."""
+    energy = np.array([np.prod(typical[list(m)]) for m in monomials]) * np.abs(coefficient)
     degree = np.array([len(m) for m in monomials])
-    known = np.nan_to_num(size)
+    known = np.nan_to_num(energy)
     largest = np.array([known[degree == d].max() for d in degree])
-    # An odd term of a flat structure is rounding: no term of a degree that hardly acts leads.
+    # Odd terms of a flat structure are rounding: degrees with hardly any energy do not count.
     return (known >= _LEADING * largest) & (largest >= _LEADING**2 * known.max())

@@ -18,10 +18,10 @@ def static_displacement(
     potential: PolynomialPotential,
     force: Float[Array, "case mode"],
 ) -> Float[Array, "case mode"]:
-    """Solve ω²q + ∂V/∂q = f, each case on the path that starts at rest.
+    """Solve ω²q + ∂V/∂q = f, each case on the equilibrium path from rest.
 
-    The load grows in steps, each with Newton's method. NaN where the path ends before the load is
-    reached, such as at a snap-through.
+    The load increases in steps, each with Newton's method. NaN if the path ends before the full
+    load, such as at a snap-through.
 
     Arguments: `frequency` in rad/s, `force` f in kg^1/2 m/s². Returns q in kg^1/2 m.
 
@@ -34,31 +34,31 @@ def static_displacement(
     def balance(q: Array, f: Array) -> Array:
         return squared * q + potential.force(q) - f
 
-    def slope(q: Array) -> Array:
+    def tangent(q: Array) -> Array:
         return jnp.diag(squared) + potential.stiffness(q)
 
-    def at_rest(full: Array) -> Array:
+    def from_rest(full: Array) -> Array:
         def step(carry: tuple[Array, Array], fraction: Array) -> tuple[tuple[Array, Array], None]:
             before, good = carry
             q = predicted = before - jnp.linalg.solve(
-                slope(before), balance(before, fraction * full)
+                tangent(before), balance(before, fraction * full)
             )
 
             def newton(_: int, q: Array) -> Array:
-                return q - jnp.linalg.solve(slope(q), balance(q, fraction * full))
+                return q - jnp.linalg.solve(tangent(q), balance(q, fraction * full))
 
             q = jax.lax.fori_loop(0, _ITERATIONS, newton, q)
-            scaled = slope(q) / jnp.sqrt(squared[:, None] * squared)
+            scaled = tangent(q) / jnp.sqrt(squared[:, None] * squared)
             moved, expected = (jnp.linalg.norm((x - before) * frequency) for x in (q, predicted))
-            # A step much longer than its tangent predicts has gone to another path.
+            # A step much longer than the tangent prediction has jumped to another path.
             good = good & (jnp.linalg.eigvalsh(scaled)[0] > 0) & (moved <= _JUMP * expected)
             return (q, good), None
 
         fractions = jnp.arange(1, _STEPS + 1) / _STEPS
         start = jnp.zeros_like(full), jnp.array(True)
         (q, stable), _ = jax.lax.scan(step, start, fractions)
-        size = jnp.max(jnp.abs(full))
-        found = stable & (jnp.max(jnp.abs(balance(q, full))) <= _TOLERANCE * size)
-        return jnp.where(found, q, jnp.nan)
+        largest = jnp.max(jnp.abs(full))
+        converged = stable & (jnp.max(jnp.abs(balance(q, full))) <= _TOLERANCE * largest)
+        return jnp.where(converged, q, jnp.nan)
 
-    return jax.vmap(at_rest)(jnp.asarray(force))
+    return jax.vmap(from_rest)(jnp.asarray(force))

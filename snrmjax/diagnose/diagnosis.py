@@ -1,4 +1,4 @@
-"""The whole diagnosis: name what explains the misfit, fit it, and check the answer."""
+"""The whole diagnosis: name the laws that explain the misfit, fit them, check the answer."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -18,14 +18,14 @@ from snrmjax.diagnose.answer_by_parts import (
     parts_of,
     verdict_of,
 )
-from snrmjax.diagnose.checks.gains import gain_found, notes_on_gains
+from snrmjax.diagnose.checks.gains import fitted_gain, notes_on_gains
 from snrmjax.diagnose.checks.residuals import (
-    HeldOutLevels,
-    held_out_levels,
-    held_out_places,
+    WithheldLevels,
     neighbour_noise,
     rms_misfit,
     tolerated,
+    withheld_level_indices,
+    withheld_levels,
     without_level,
 )
 from snrmjax.diagnose.design.discriminating_test import recommendation, recommended_test
@@ -41,7 +41,7 @@ from snrmjax.diagnose.diagnosis_result import (
     completed_model,
 )
 from snrmjax.diagnose.explained_parts import named_parts
-from snrmjax.diagnose.fitted_effects import FoundEffects
+from snrmjax.diagnose.fitted_effects import FittedEffects
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference
 from snrmjax.diagnose.misfit.locating import Located, locate_misfit
 from snrmjax.diagnose.misfit.noise_model import notes_without_phases, unit_columns
@@ -76,24 +76,25 @@ def diagnose_model(
     force_gain_std: float = 0.0,
     former: FormerAnswer | None = None,
 ) -> Diagnosis:
-    """Find the physics that a model lacks to explain measured steady states.
+    """Identify the physics that a model lacks to explain measured steady states.
 
-    Every state reads the mode's stiffness and damping, and every other recorded harmonic, beyond
-    the model. These readings name the laws that explain most of them, by parts (`naming`); what is
-    left is drawn. The laws are then fitted together by harmonic balance at the measured motions.
+    Every state gives the mode's stiffness and damping, and other recorded harmonics, in excess of
+    the model. The laws that explain most of this excess are named by parts (`naming`); the
+    remainder is drawn as a free curve. The laws are then fitted together by harmonic balance at the
+    measured motions.
 
-    `force_gain_std` is the relative 1σ of a gain that all forces share: 1 where it is unknown.
-    `former` is the answer by fewer of these states: the notes say what the further states changed.
-    Where the force is known as a drive voltage only, a first value of its gain is found and the
-    gain is free. Where neither noise nor errors of levels are stated, both are estimated: the noise
-    is what smooth curves leave, and the level-to-level variance what no smooth curves of amplitude
-    explain. Where phases were not recorded, they are those of smooth curves with the recorded
-    amplitudes, and the sizes alone count.
+    `force_gain_std`: relative 1σ of a gain common to all forces; 1 where it is unknown.
+    `former`: the answer from fewer of these states; a note reports what the further states changed.
+    With a drive voltage in index of the force, the gain is estimated and left free. Noise and level
+    errors that are not stated are estimated: the noise from the scatter about smooth curves of
+    amplitude, the level errors from the variance between levels that such curves leave. Phases that
+    were not recorded are those of smooth curves with the recorded amplitudes; then only magnitudes
+    are compared.
 
-    Returns a `Diagnosis`; `diagnose.priors` has all numbers that decide its verdict.
+    Returns a `Diagnosis`; `diagnose.priors` has the thresholds of its verdict.
     Raises `ValueError` for too few states, an unknown force or sensors other than the model's.
     Validity: steady motions with the period of the force; effects that change the motion
-    moderately, so that two of them add up.
+    moderately, so that their contributions add up.
     Not differentiable: differentiate the force that a motion needs:
     `snrmjax.identify.inverse_force`.
     """
@@ -109,17 +110,17 @@ def diagnose_model(
     excluded = excluded_kinds(model, force_gain_std, phases=phases)
     named = named_parts(recorded, data, [kind for kind in EFFECTS if kind not in excluded])
     predictions = _corrected_predictions(recorded.with_kinds(kinds_to_fit(named)), data)
-    found = fitted_parts(named, predictions, data)
-    checked = _Checked.of(found)
-    misfit, fit, naming = checked.misfit, found.fit, named.naming
+    fitted = fitted_parts(named, predictions, data)
+    checked = _Checked.of(fitted)
+    misfit, fit, naming = checked.misfit, fitted.fit, named.naming
     completed = _completed(model, checked)
-    verdict, reasons = verdict_of(named, found)
+    verdict, reasons = verdict_of(named, fitted)
     probabilities = answers_of(naming, verdict)
     notes += reasons
     if former is not None:
         notes.append(former.changed_to(probabilities))
     answer = _answer(verdict, probabilities, checked, completed)
-    before, after = rms_misfit(misfit, found.baseline), rms_misfit(misfit, fit)
+    before, after = rms_misfit(misfit, fitted.baseline), rms_misfit(misfit, fit)
     if not agrees(naming, after):
         answer = answer._replace(force_gain=1.0)
     elif gain is not None and answer.effects:
@@ -128,22 +129,24 @@ def diagnose_model(
     notes += _notes_on_answer(checked, completed) if agrees(naming, after) else []
     recorded_phases = not unknown[:, 0].any()
     open_classes = verdict is Verdict.AMBIGUOUS and recorded_phases
-    test = recommended_test(found) if open_classes else None
-    asked = recommendation(found, test, phases=recorded_phases) if verdict.is_answer else None
-    if verdict is Verdict.NOTHING_MISSING:  # errors of levels that nobody stated are taken out
+    test = recommended_test(fitted) if open_classes else None
+    recommended = (
+        recommendation(fitted, test, phases=recorded_phases) if verdict.is_answer else None
+    )
+    if verdict is Verdict.NOTHING_MISSING:  # less estimated level errors
         before = after = min(after, naming.misfit)
     diagnosis = Diagnosis(
         verdict=verdict,
         answer=answer,
-        recommended=asked,
+        recommended=recommended,
         discriminating_test=test,
         located=checked.located,
         gap=Gap(before, after, *(checked.levels or (None, None))),
-        checks=Checks(found.p_value, float(np.sqrt(checked.neighbours)), completed.without),
+        checks=Checks(fitted.p_value, float(np.sqrt(checked.neighbours)), completed.without),
         detection_limits=detection_limits(named.problem, naming, excluded),
-        table=found.table,
+        table=fitted.table,
         notes=tuple(notes),
-        force_misfit=_force_misfit(misfit, found.baseline, fit),
+        force_misfit=_force_misfit(misfit, fitted.baseline, fit),
         data=data,
         parts=parts_of(naming, explained=all(r.kind != "no_effect_explains" for r in reasons)),
     )
@@ -167,58 +170,58 @@ def _check_states(predictions: Predictions) -> None:
 
 
 def _corrected_predictions(predictions: Predictions, data: SteadyStates) -> Predictions:
-    """Predictions weighed by what the states show by themselves, of corrected records."""
+    """Predictions of corrected records, weighted by the smooth curves through the states."""
     predictions = with_reference(predictions)
     if not np.isfinite(weighted_misfit(predictions).base).all():
         raise ValueError(
             "the model has no motion of the measured amplitude for some states: it is too far "
-            "from the data to be compared."
+            "from the data for a comparison."
         )
     return at_reference(predictions, data)
 
 
 class _Checked(NamedTuple):
-    """An answer with what is found of it beyond its fit."""
+    """An answer with the checks beyond its fit."""
 
-    found: FoundEffects
-    misfit: WeightedMisfit  # with velocities of unknown phase where the answer has them
+    fitted: FittedEffects
+    misfit: WeightedMisfit  # with unknown phases set to those of the answer
     located: tuple[Located, ...]
     neighbours: float  # variance over the stated one
-    levels: HeldOutLevels | None
+    levels: WithheldLevels | None
     parameters: dict[str, Estimate]
 
     @classmethod
-    def of(cls, found: FoundEffects) -> "_Checked":
-        """The checks of what a search found."""
-        fit, misfit = found.fit, at_phases_of(found.misfit, found.fit)
+    def of(cls, fitted: FittedEffects) -> "_Checked":
+        """The checks of fitted effects."""
+        fit, misfit = fitted.fit, at_phases_of(fitted.misfit, fitted.fit)
         neighbours = neighbour_noise(misfit, fit)
-        levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours))
-        located = locate_misfit(misfit, found.baseline)
-        return cls(found, misfit, located, neighbours, levels, _estimates(misfit, fit))
+        levels = withheld_levels(misfit, fitted.baseline, fit, tolerated(neighbours))
+        located = locate_misfit(misfit, fitted.baseline)
+        return cls(fitted, misfit, located, neighbours, levels, _estimates(misfit, fit))
 
 
 class _Completed(NamedTuple):
-    """The completed model, and by level that of the other levels' states."""
+    """The completed model, and by level the one completed without it."""
 
     given: Structure
     whole: CompletedModel
     without: dict[int, Structure]
-    refused: tuple[int, ...]  # levels without which there is none
+    refused: tuple[int, ...]  # levels without which it is not physical
 
 
 def _completed(model: Structure, checked: _Checked) -> _Completed:
-    misfit, fit = checked.misfit, checked.found.fit
+    misfit, fit = checked.misfit, checked.fitted.fit
     values = {name: one.value for name, one in checked.parameters.items()}
     whole = completed_model(model, misfit.baseline_parameters(fit.rows), fit.kinds, values)
     without = {}
-    for place in held_out_places(misfit) if fit.kinds else ():
-        parameters, baseline = without_level(misfit, fit, place)
+    for index in withheld_level_indices(misfit) if fit.kinds else ():
+        parameters, baseline = without_level(misfit, fit, index)
         of_others = dict(zip(fit.labels, parameters.tolist(), strict=True))
-        level = int(misfit.level_numbers[place])
+        level = int(misfit.level_numbers[index])
         without[level] = completed_model(model, baseline, fit.kinds, of_others).model
-    there = {level: one for level, one in without.items() if one is not None}
+    physical = {level: one for level, one in without.items() if one is not None}
     refused = tuple(level for level, one in without.items() if one is None)
-    return _Completed(model, whole, there, refused)
+    return _Completed(model, whole, physical, refused)
 
 
 def _answer(
@@ -227,10 +230,10 @@ def _answer(
     checked: _Checked,
     completed: _Completed,
 ) -> Answer:
-    fit, gain = checked.found.fit, gain_found(checked.misfit, checked.found.fit)
+    fit, gain = checked.fitted.fit, fitted_gain(checked.misfit, checked.fitted.fit)
     return Answer(
         effects=fit.kinds if verdict.is_answer else (),
-        candidates=checked.found.classes if verdict.is_answer else (),
+        candidates=checked.fitted.classes if verdict.is_answer else (),
         parameters=checked.parameters,
         status=fit.status,
         completed=completed.whole.model,
@@ -241,9 +244,9 @@ def _answer(
 
 
 def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> set[str]:
-    """Kinds of effects that are not looked for."""
+    """Kinds of effects excluded from the search."""
     excluded = {effect.kind for effect in model.effects}
-    if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
+    if force_gain_std > 0:  # a free gain already covers gain and mass errors
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.like_force_gain}
     if force_gain_std > priors.LOOSE_GAIN:
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.follows_force}
@@ -254,9 +257,9 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
 
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
     """The effects' parameters and their 1σ."""
-    sensitivities, size = unit_columns(misfit.noise.decorrelated(fit.slopes.T).T)
+    sensitivities, norm = unit_columns(misfit.noise.decorrelated(fit.slopes.T).T)
     inverse = np.linalg.pinv(sensitivities.T @ sensitivities, rcond=1e-12, hermitian=True)
-    std = np.sqrt(np.diag(inverse)) / size
+    std = np.sqrt(np.diag(inverse)) / norm
     return {
         label: Estimate(float(value), float(error))
         for label, value, error in zip(fit.labels, fit.values, std, strict=True)
@@ -277,15 +280,15 @@ def _force_misfit(misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit) -
 
 
 def _notes_on_data(checked: _Checked) -> Iterator[Fact | str]:
-    """What is taken for noise and for errors of levels where these are not stated, and phases."""
-    predictions = checked.found.misfit.predictions
+    """Notes on estimated noise and level errors where not stated, and on unknown phases."""
+    predictions = checked.fitted.misfit.predictions
     if not predictions.chosen.noise_stated:
         yield Fact("noise_not_stated", size=ASSUMED_ERROR * predictions.error_scale)
     differing = predictions.reference.posterior.differing if predictions.reference else (False,) * 4
-    free = np.where(predictions.unstated_levels, predictions.level_sizes, 0.0)
+    free = np.where(predictions.unstated_levels, predictions.level_error_std, 0.0)
     for of_data, which in ((True, differing), (False, ~np.array(differing))):
-        gain, phase, stiffness, damping = sizes = np.where(which, free, 0.0).tolist()
-        if any(sizes):
+        gain, phase, stiffness, damping = stds = np.where(which, free, 0.0).tolist()
+        if any(stds):
             fractions = {"gain": gain, "frequency": 0.5 * stiffness, "damping": damping}
             yield Fact("levels_not_stated", phase=phase, **fractions, of_data=of_data)
     chosen = checked.misfit.predictions.chosen
@@ -297,7 +300,7 @@ def _notes_on_data(checked: _Checked) -> Iterator[Fact | str]:
 
 
 def _notes_on_answer(checked: _Checked, completed: _Completed) -> Iterator[Fact]:
-    misfit, fit = checked.misfit, checked.found.fit
+    misfit, fit = checked.misfit, checked.fitted.fit
     yield from notes_on_gains(misfit, fit)
     if completed.whole.reason:
         yield Fact("not_physical", reason=completed.whole.reason)
@@ -305,14 +308,14 @@ def _notes_on_answer(checked: _Checked, completed: _Completed) -> Iterator[Fact]
         yield Fact("not_physical_without", levels=completed.refused)
     if not (fit.status.found_minimum or fit.status is MinimisationStatus.NOT_FITTED):
         yield Fact("answer_not_converged")
-    rows = [row for step in checked.found.table for row in step]
+    rows = [row for step in checked.fitted.table for row in step]
     lost = {row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE}
     if lost:
         yield Fact("effects_not_fitted", effects=tuple(sorted(lost)))
 
 
 def _frequency_shift(model: Structure, completed: Structure) -> float:
-    """Relative shift of the natural frequency by the linear changes that were found."""
+    """Relative shift of the natural frequency by the identified linear changes."""
     j, added = model.modes.mode_of_interest, completed.effects[len(model.effects) :]
     linear = [effect for effect in added if isinstance(effect, AbstractLinearChange)]
     changed = dataclasses.replace(model, effects=(*model.effects, *linear))

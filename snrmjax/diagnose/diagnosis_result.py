@@ -1,4 +1,4 @@
-"""What a diagnosis finds: the answer, how well it is known, and what would decide what is open."""
+"""Result of a diagnosis: the answer, its uncertainty, and the measurement that would decide."""
 
 import dataclasses
 import itertools
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.residuals import HeldOut
+from snrmjax.diagnose.checks.residuals import WithheldLevel
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.fitted_effects import TriedEffect
@@ -33,11 +33,11 @@ class CompletedStatus(StrEnum):
 
     COMPLETED = "completed"
     NOTHING_ADDED = "nothing_added"  # the model as given
-    NOT_PHYSICAL = "not_physical"  # the parameters that fit best are none of a structure
+    NOT_PHYSICAL = "not_physical"  # the best-fit parameters are not physical
 
 
 class CompletedModel(NamedTuple):
-    """The model with what was found, or why there is none."""
+    """The completed model, or the reason why there is none."""
 
     model: Structure | None
     status: CompletedStatus
@@ -52,9 +52,9 @@ def completed_model(
 ) -> CompletedModel:
     """The model with effects added and its own parameters at their most likely values.
 
-    Arguments: `baseline` has new values of the model's own parameters, `values` those of the
-    added effects, both by name. Where one of them is none that a structure can have, such as a
-    negative frequency, there is no model but a reason.
+    Arguments: `baseline`: new values of the model's own parameters; `values`: those of the added
+    effects, both by name. An unphysical value, such as a negative frequency, gives a reason in
+    place of a model.
     """
     if not kinds:
         return CompletedModel(model, CompletedStatus.NOTHING_ADDED)
@@ -69,8 +69,8 @@ def completed_model(
         )
     except ValueError as error:
         return CompletedModel(None, CompletedStatus.NOT_PHYSICAL, str(error))
-    moved = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
-    completed = dataclasses.replace(moved, effects=(*model.effects, *added))
+    updated = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
+    completed = dataclasses.replace(updated, effects=(*model.effects, *added))
     return CompletedModel(completed, CompletedStatus.COMPLETED)
 
 
@@ -82,15 +82,15 @@ class Estimate(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """The effects that were found, and the model with them."""
+    """The identified effects, and the model completed with them."""
 
     effects: tuple[str, ...]  # in the order added
-    candidates: tuple[tuple[str, ...], ...]  # of every effect: itself, and what fits as well
+    candidates: tuple[tuple[str, ...], ...]  # of every effect: itself, and what fits equally well
     parameters: dict[str, Estimate]
     status: MinimisationStatus
-    completed: Structure | None  # None where no structure can have these parameters
+    completed: Structure | None  # None where these parameters are not physical
     completed_status: CompletedStatus
-    force_gain: float  # acting force over recorded one, where a gain was free; else 1
+    force_gain: float  # acting over recorded force, where a gain was free; else 1
     probabilities: dict[Kinds, float]  # of all answers considered
     laws: tuple[DrawnLaw, ...] = ()  # where the verdict is `DRAWN`, the most important first
 
@@ -100,53 +100,55 @@ class Gap(NamedTuple):
 
     before: float
     after: float
-    interpolated: HeldOut | None  # a level between others, left out of the fit
-    extrapolated: HeldOut | None  # the top level, left out of the fit
+    interpolated: WithheldLevel | None  # a level between others, left out of the fit
+    extrapolated: WithheldLevel | None  # the top level, left out of the fit
 
 
 class Checks(NamedTuple):
-    """How the answer fared beyond its own fit."""
+    """Checks of the answer beyond its own fit."""
 
-    p_value: float  # of the misfit that is left
-    noise_scale: float  # that neighbouring states show, over the stated noise
-    completed_without: dict[int, Structure]  # by level: completed without a level's states
+    p_value: float  # of the remaining misfit
+    noise_scale: float  # scatter of neighbouring states over the stated noise
+    completed_without: dict[int, Structure]  # by level: model completed without its states
 
 
 class ForceMisfit(NamedTuple):
-    """Misfit of the force over noise, less errors that states share.
+    """Misfit of the force over noise, less shared errors.
 
-    NaN where the size alone is compared.
+    NaN where only the magnitude is compared.
     """
 
-    rows: Int[np.ndarray, " state"]  # of the data, that were used
-    sensor: int  # whose velocity was prescribed
+    rows: Int[np.ndarray, " state"]  # rows of the data that were used
+    sensor: int  # of the prescribed velocity
     before: Float[np.ndarray, "state part"]
     after: Float[np.ndarray, "state part"]
 
 
 class Diagnosis(AbstractResult):
-    """What a model lacks, how well that is known, and what would decide what is open.
+    """What a model lacks, with its uncertainty and the measurement that would decide.
 
-    Its effects act on the mode of interest. Where the force acts at a point instead, the verdict
-    may be `UNKNOWN` here and `NAMED` for the whole test: see `snrmjax.pipelines.diagnose_test`,
-    whose result has the verdict of `diagnosis.json`.
+    Its effects act on the mode of interest. For a force at a point the verdict may be `UNKNOWN`
+    here and `NAMED` for the whole test: see `snrmjax.pipelines.diagnose_test`, whose result has
+    the verdict of `diagnosis.json`.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("candidate", "part", "parameter")
 
     verdict: Verdict
     answer: Answer
-    recommended: Fact | None  # the measurements that would decide what is open
-    discriminating_test: DiscriminatingTest | None  # of these, where one was compared
+    recommended: Fact | None  # the measurements that would decide
+    discriminating_test: DiscriminatingTest | None  # the compared test among these, if any
     located: tuple[Located, ...]
     gap: Gap
     checks: Checks
     detection_limits: dict[str, float]
-    table: tuple[tuple[TriedEffect, ...], ...]  # what each step of the search compared
+    table: tuple[tuple[TriedEffect, ...], ...]  # effects compared, by step of the search
     notes: tuple[Fact | str, ...]
     force_misfit: ForceMisfit
-    data: SteadyStates  # as they were compared: in N, where a drive voltage was given
-    parts: tuple[PartAnswer, ...] = ()  # what changes stiffness and damping, and by how much
+    data: SteadyStates  # as compared: in N, also where a drive voltage was given
+    parts: tuple[
+        PartAnswer, ...
+    ] = ()  # what changes stiffness, damping and harmonics, and by how much
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -155,7 +157,7 @@ class Diagnosis(AbstractResult):
 
     @property
     def candidates(self) -> tuple[tuple[str, ...], ...]:
-        """Of every effect the class that the data cannot tell from it, itself first."""
+        """For every effect the class that the data cannot distinguish from it, itself first."""
         return self.answer.candidates
 
     @property
@@ -165,7 +167,7 @@ class Diagnosis(AbstractResult):
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """Of every answer considered, the most probable first; effects are joined by `+`.
+        """Of all answers considered, the most probable first; effects are joined by `+`.
 
         `none`, `unknown` and, where noise is stated, `noise_rejected` are among them.
         """
@@ -173,14 +175,16 @@ class Diagnosis(AbstractResult):
 
     @property
     def probability(self) -> float:
-        """That the answer given is right: its verdict, or an answer of effects in its classes."""
+        """Of the given answer: its verdict, or any answer of effects in its classes."""
         verdict = Verdict(self.verdict)
         if not verdict.is_answer:
             return self.answer.probabilities.get((verdict.value,), 0.0)
-        given = {kind for group in self.candidates for kind in group}
+        allowed = {kind for group in self.candidates for kind in group}
         if verdict is Verdict.DRAWN:
-            given |= {*DRAWN.values()}
-        return float(sum(p for kinds, p in self.answer.probabilities.items() if given >= {*kinds}))
+            allowed |= {*DRAWN.values()}
+        return float(
+            sum(p for kinds, p in self.answer.probabilities.items() if allowed >= {*kinds})
+        )
 
     @property
     def completed(self) -> Structure | None:
@@ -189,7 +193,7 @@ class Diagnosis(AbstractResult):
 
     @property
     def decide_by(self) -> str | None:
-        """The measurements that would decide what is open, in words."""
+        """The measurements that would decide, in words."""
         return None if self.recommended is None else str(self.recommended)
 
     @property
@@ -219,7 +223,7 @@ class Diagnosis(AbstractResult):
         """See `AbstractResult`."""
         gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
         unsure = bool(self.parameters) and gap.after > priors.AS_NOISE
-        ended = self.answer.completed_status
+        completion = self.answer.completed_status
         lines = [
             Fact("probability_of_verdict", probability=self.most_probable()),
             *(
@@ -233,7 +237,7 @@ class Diagnosis(AbstractResult):
                 if out is not None
             ),
             *([] if self.recommended is None else [Fact("to_decide", by=self.recommended)]),
-            Fact("diagnosis_ended", fit=self.answer.status.value, completed=ended.value),
+            Fact("diagnosis_ended", fit=self.answer.status.value, completed=completion.value),
             *(Fact("diagnosis_note", note=note) for note in self.notes),
         ]
         return (f"Diagnosis: {self.verdict_sentence}", *map(str, lines))
@@ -252,13 +256,13 @@ class Diagnosis(AbstractResult):
         columns = {
             "candidate": (_texts(row.kind for row in rows), "", "effect compared"),
             "step": ([number for number, _ in tried], "1", "step of the search"),
-            "gain": ([r.gain for r in rows], "1", "fall of Schwarz's criterion"),
-            "chi_square": ([r.chi_square for r in rows], "1", "χ² that is left"),
-            "fit_status": (_texts(r.status.value for r in rows), "", "end of the fit"),
+            "gain": ([r.gain for r in rows], "1", "decrease of Schwarz's criterion"),
+            "chi_square": ([r.chi_square for r in rows], "1", "remaining χ²"),
+            "fit_status": (_texts(r.status.value for r in rows), "", "status of the fit"),
             "part": (_texts(p.part for p in self.located), "", "part of the misfit"),
             "velocity_low_m_s": (ranges[:, 0], "m/s", "lowest velocity affected"),
             "velocity_high_m_s": (ranges[:, 1], "m/s", "highest velocity affected"),
-            "p_value": ([p.p_value for p in self.located], "1", "by chance"),
+            "p_value": ([p.p_value for p in self.located], "1", "p-value"),
             "exponent": (exponent[:, 0], "1", "power of amplitude"),
             "exponent_std": (exponent[:, 1], "1", "1σ of the power"),
             "parameter": (_texts(names), "", "parameter of an effect"),
@@ -288,7 +292,7 @@ class Diagnosis(AbstractResult):
 
 
 def _fact_of(part: PartAnswer) -> Fact:
-    """What a part of the change is by, for a reader."""
+    """The laws of one part of the change, as a fact to report."""
     return Fact(
         "part_of_change",
         part=part.part,
@@ -301,25 +305,25 @@ def _fact_of(part: PartAnswer) -> Fact:
 
 
 def unit_of(parameter: str) -> str:
-    """The unit of a parameter, named by its effect and itself; "" where none is stated."""
+    """The unit of a parameter `effect.name`; "" where none is stated."""
     kind, _, name = parameter.partition(".")
     return EFFECTS[kind].parameters()[name].unit if kind in EFFECTS else ""
 
 
 def _texts(texts: Iterable[str]) -> np.ndarray:
-    """Texts as an array of texts, without any of them too."""
+    """Texts as an array of strings, also if empty."""
     return np.array(list(texts), dtype=np.str_)
 
 
 class FormerAnswer(NamedTuple):
-    """What a diagnosis of fewer states said."""
+    """The answer of a former diagnosis, of fewer states."""
 
     verdict: str
     effects: tuple[str, ...]
     probabilities: Mapping[Kinds, float]  # of the answers considered
 
     def changed_to(self, probabilities: Mapping[Kinds, float]) -> Fact:
-        """What further states did to the answers that were likely before, or are now."""
+        """The change, by further states, of the answers that were likely before or are now."""
         least, before = 0.05, self.probabilities
         likely = [kinds for kinds, p in before.items() if p >= least]
         likely += [kinds for kinds in list(probabilities)[:1] if kinds in before]

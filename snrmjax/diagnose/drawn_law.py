@@ -1,4 +1,4 @@
-"""A law that was drawn from data and stands in no library."""
+"""A force law estimated from data as a free curve, for lack of a library law."""
 
 from typing import NamedTuple
 
@@ -10,21 +10,21 @@ from snrmjax.numerics.facts import Fact
 
 
 class LawOnset(NamedTuple):
-    """From where on a force is seen, or changes its sign."""
+    """Where a force sets in, or changes its sign."""
 
     at: float  # m or m/s
     side: int  # 1 or −1 of a law that differs between positive and negative values, else 0
-    adds: bool  # to stiffness or damping
+    adds: bool  # whether it increases stiffness or damping
 
 
 class DrawnLaw(NamedTuple):
-    """A law that was drawn from data, as an equivalent force at the reference sensor.
+    """A law estimated from data, as an equivalent force at the reference sensor.
 
-    `at` is the displacement (m) or the velocity (m/s) of that sensor, `force` (N) what a spring, a
-    damper or a joint between the sensor's point and the ground would have to exert there beside
-    the linear model, with its 1σ: of a mode of the shape φ at the sensor, x = φq, and φ times the
-    force is the modal force. Of friction it is the first loading from rest, beside the stuck
-    stiffness; of a damping that depends on the displacement the force at the velocity `passing`.
+    `at` is the displacement (m) or velocity (m/s) of that sensor; `force` (N), with its 1σ, is that
+    of a spring, damper or joint between the sensor's point and the ground, in addition to the
+    linear model. With the mode shape φ at the sensor x = φq, and φ times the force is the modal
+    force. For friction it is the initial loading curve, in addition to the stuck stiffness; for
+    displacement-dependent damping it is the force at the velocity `passing`.
     """
 
     law: str  # "spring", "damper", "displacement_damping" or "slip"
@@ -34,7 +34,7 @@ class DrawnLaw(NamedTuple):
     at: Float[np.ndarray, " knot"]
     force: Float[np.ndarray, " knot"]
     force_std: Float[np.ndarray, " knot"]
-    largest: float  # of `at`, that was measured: what is beyond is extrapolated
+    largest: float  # measured value of `at`; beyond it the law is extrapolated
     passing: float | None = None  # m/s
 
     @property
@@ -44,5 +44,5 @@ class DrawnLaw(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its class in words, and from where on it acts which way."""
+        """Its class and its onsets in words."""
         return str(Fact("law_class", law=self.law, symmetries=self.symmetries, onsets=self.onsets))

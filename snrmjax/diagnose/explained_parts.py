@@ -1,4 +1,4 @@
-"""Naming for a test and a model: the mode's readings beyond the model, and what explains them."""
+"""Naming for a test and a model: the mode's excess over the model, and the laws behind it."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -44,23 +44,23 @@ from snrmjax.model.library.measurement_chain import (
 from snrmjax.model.modes import linear_response, residual_velocity
 from snrmjax.numerics.blocks import padded
 
-_ANY_PHASE = 1.0  # rad, 1σ of a phase that was not recorded, about the likely one
+_ANY_PHASE = 1.0  # rad, 1σ of an unrecorded phase about its estimate
 _SEEN_BY_HARMONICS = (AbstractAddedMode, ModeShapeChange)
-"""What only other harmonics tell from a law: one sensor's fundamental follows either."""
+"""Effects that only harmonics distinguish from a law: the fundamental of one sensor fits both."""
 
 
 class NamedParts(NamedTuple):
-    """A naming, and the problem that it is of."""
+    """A naming and its linear problem."""
 
     naming: Naming
     problem: Problem
 
 
 def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[str]) -> NamedParts:
-    """What explains most of the change of stiffness, damping and every other harmonic.
+    """The laws behind the change of stiffness, damping and every other harmonic.
 
-    Arguments: `data` as they were measured; `kinds` of effects that may be missing. States without
-    phases count by their sizes alone.
+    Arguments: `data`: as measured; `kinds`: the effects that may be missing. States without phases
+    count by their magnitudes alone.
     """
     unknown = predictions.chosen.phase_unknown[:, 0]
     if unknown.any():
@@ -71,7 +71,7 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     if readings.posterior.phase_is_controlled:
         kinds = [k for k in kinds if _shows_at_one_phase(k)]
     gain, phase, *_ = readings.posterior.hyper.level_std
-    # What all levels have in common is theirs where their own errors are about as large.
+    # A gain or phase common to all levels may be the mean of level errors as large as that.
     if gain > priors.OF_LEVELS * priors.GAIN:
         kinds = [k for k in kinds if not (is_instrument(k) and EFFECTS[k].like_force_gain)]
     if phase > priors.OF_LEVELS * priors.INSTRUMENT_PHASE:
@@ -89,7 +89,7 @@ def _shows_at_one_phase(kind: str) -> bool:
 
 
 def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predictions:
-    """Velocities of unknown phase at those of smooth curves with the recorded sizes."""
+    """Velocities of unknown phase at the phases of smooth curves with the recorded magnitudes."""
     chosen, modes = predictions.chosen, predictions.given.modes
     rows = np.arange(len(chosen.rows))
     states = test_states_of(predictions, rows)
@@ -101,15 +101,15 @@ def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predict
     )
     shape = modes.mode_shape[chosen.sensors[0], modes.mode_of_interest]
     behind = np.pi if float(shape * participation_of(modes)) < 0 else 0.0
-    found = predictions.with_phases(np.pi / 2 - np.angle(z) + behind)
+    likely = predictions.with_phases(np.pi / 2 - np.angle(z) + behind)
     error: Any = np.asarray(chosen.states.error).copy()
     error[chosen.phase_unknown[:, 0], 1 + len(chosen.sensors)] = _ANY_PHASE
-    states_found = found.chosen.states._replace(error=error)
-    return dataclasses.replace(found, chosen=found.chosen._replace(states=states_found))
+    states_likely = likely.chosen.states._replace(error=error)
+    return dataclasses.replace(likely, chosen=likely.chosen._replace(states=states_likely))
 
 
 def overall(naming: Naming) -> Verdict:
-    """The verdict on all parts: the weakest of those that change by more than noise."""
+    """The verdict on all parts: the weakest among those with a significant change."""
     verdicts = [Verdict(part.verdict) for part in naming.parts]
     order = (Verdict.DRAWN, Verdict.AMBIGUOUS, Verdict.NAMED)
     return next((one for one in order if one in verdicts), Verdict.NOTHING_MISSING)
@@ -120,7 +120,7 @@ def _readings(predictions: Predictions, data: SteadyStates, unknown: np.ndarray)
     states, modes = test_states_of(predictions, rows), predictions.given.modes
     if unknown.any():
         errors = states.errors.copy()
-        if not states.stated:  # over those of sizes, which are taken for `ASSUMED_ERROR`
+        if not states.stated:  # over those of magnitudes, taken as `ASSUMED_ERROR`
             errors[unknown, 2] = _ANY_PHASE / ASSUMED_ERROR
         states = states._replace(errors=errors, phase_std=0.0)
     j = modes.mode_of_interest
@@ -139,9 +139,9 @@ def _readings(predictions: Predictions, data: SteadyStates, unknown: np.ndarray)
         ),
         scales_of(predictions),
     )
-    # The other harmonics of a state turn with its fundamental, whose phase must be known.
-    not_read = bool(unknown.any()) or not is_single(modes)
-    recorded = _recorded_harmonics(predictions, rows, none=not_read)
+    # The phases of harmonics are relative to the fundamental, whose phase must be known.
+    no_harmonics = bool(unknown.any()) or not is_single(modes)
+    recorded = _recorded_harmonics(predictions, rows, none=no_harmonics)
     model = _motion_of_model(predictions, data, rows, recorded.order)
     return readings_of(states, order, model, linear, recorded, phases_known=not unknown.any())
 
@@ -149,21 +149,21 @@ def _readings(predictions: Predictions, data: SteadyStates, unknown: np.ndarray)
 def _recorded_harmonics(
     predictions: Predictions, rows: np.ndarray, *, none: bool
 ) -> RecordedHarmonics:
-    """Harmonics at the reference sensor, and what an exciter's would cause there."""
+    """Harmonics at the reference sensor, and its response to harmonics of the exciter force."""
     chosen, modes = predictions.chosen, predictions.given.modes
     sensor, orders = chosen.sensors[0], () if none else chosen.orders
     states, n = chosen.states, len(chosen.sensors)
-    first = 2 * n  # of the columns of the reference sensor's harmonics
-    size = np.abs(np.asarray(states.velocity)[rows, 0])[:, None]
-    std = np.asarray(states.own_std)[rows, first : first + 2 * len(orders) : 2] * size
+    first = 2 * n  # column of the reference sensor's harmonics
+    speed = np.abs(np.asarray(states.velocity)[rows, 0])[:, None]
+    std = np.asarray(states.own_std)[rows, first : first + 2 * len(orders) : 2] * speed
     known = np.asarray(states.known)[rows, first : first + 2 * len(orders) : 2]
     forced = np.zeros((len(rows), len(orders)), complex)
-    for place, order in enumerate(orders):
+    for index, order in enumerate(orders):
         load: list[Any] = [
             padded(order * np.asarray(states.frequency)[rows]),
             padded(np.asarray(states.force)[rows]),
         ]
-        forced[:, place] = np.asarray(linear_response(modes, *load))[: len(rows), sensor]
+        forced[:, index] = np.asarray(linear_response(modes, *load))[: len(rows), sensor]
     velocity = np.asarray(states.harmonics)[rows, 0, : len(orders)]
     return RecordedHarmonics(orders, velocity, np.where(known, std, np.nan), forced)
 
@@ -171,7 +171,7 @@ def _recorded_harmonics(
 def _motion_of_model(
     predictions: Predictions, data: SteadyStates, rows: np.ndarray, orders: tuple[int, ...]
 ) -> MotionOfModel:
-    """The motion that the model has: of a linear mode as written, else by balance."""
+    """The model's motion: in closed form for a linear mode, else by harmonic balance."""
     model = predictions.given
     modes, sensor = model.modes, predictions.chosen.sensors[0]
     j = modes.mode_of_interest
@@ -185,7 +185,7 @@ def _motion_of_model(
         return linear
     constant = modes.mode_shape.item(sensor, j) * float(participation_of(modes))
     used = predictions.chosen.rows[rows]
-    # Linear parameters have columns of their own.
+    # Errors of linear parameters have columns of their own.
     names = [name for name in predictions.stated if not name.startswith("mode_")]
     stds = np.array([predictions.stated[name][1] for name in names])
 
@@ -200,18 +200,18 @@ def _motion_of_model(
         recorded = np.asarray(data.velocity).copy()
         recorded[used, sensor] = own + rest[:, sensor] * force
         known = jnp.asarray(recorded), jnp.zeros_like(data.phase_std)
-        moved = eqx.tree_at(lambda d: (d.velocity, d.phase_std), data, known)
-        there = predictions_of(model, moved, kinds=())
-        found = there.of(there.group.values[None], names)
-        columns = np.moveaxis(found.slopes[0] * stds, 2, 0) + found.columns[0]
-        parts = np.concatenate([found.columns, columns])
+        prescribed = eqx.tree_at(lambda d: (d.velocity, d.phase_std), data, known)
+        there = predictions_of(model, prescribed, kinds=())
+        predicted = there.of(there.group.values[None], names)
+        columns = np.moveaxis(predicted.slopes[0] * stds, 2, 0) + predicted.columns[0]
+        parts = np.concatenate([predicted.columns, columns])
         parts = parts[..., 0::2] + 1j * parts[..., 1::2]
         chosen = there.chosen
-        size, n = np.abs(np.asarray(chosen.states.velocity)[:, :1]), len(chosen.sensors)
+        speed, n = np.abs(np.asarray(chosen.states.velocity)[:, :1]), len(chosen.sensors)
         measured = np.asarray(chosen.states.harmonics)[:, 0]
-        higher = (measured + parts[:, :, n : n + len(chosen.orders)] * size)[..., : len(orders)]
+        higher = (measured + parts[:, :, n : n + len(chosen.orders)] * speed)[..., : len(orders)]
         needed = force * (1 + parts[:, :, 0])
-        # The rest of the motion at the force that the model needs, and not the measured one.
+        # Residual modes respond to the force that the model needs, not to the measured one.
         mode = own + rest[:, sensor] * (force - needed)
         return ModelMotion(1j * omega * driven * needed / (mode * to_mode), higher)
 

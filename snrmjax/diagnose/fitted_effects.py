@@ -29,23 +29,23 @@ class TriedEffect(NamedTuple):
     status: MinimisationStatus
 
 
-class FoundEffects(NamedTuple):
-    """The effects of an answer, fitted, and those that may stand in their place."""
+class FittedEffects(NamedTuple):
+    """The fitted effects of an answer, and the alternatives to them."""
 
-    misfit: WeightedMisfit  # with errors passed on as the answer passes them
+    misfit: WeightedMisfit  # with errors propagated through the answer
     fit: EffectFit
     baseline: EffectFit
     table: tuple[tuple[TriedEffect, ...], ...]
-    classes: tuple[tuple[str, ...], ...] = ()  # of every effect: itself, then those as probable
+    classes: tuple[tuple[str, ...], ...] = ()  # of every effect: itself, then its alternatives
 
     @property
     def p_value(self) -> float:
-        """Probability by chance of at least the misfit that is left."""
+        """p-value of the remaining misfit."""
         return self.fit.p_value
 
 
 def refitted(misfit: WeightedMisfit, fit: EffectFit) -> EffectFit:
-    """The same effects fitted to another misfit, all together from where they were."""
+    """The same effects refitted together to another misfit, from their current values."""
     if not fit.kinds:
         return baseline_fit(misfit)
     *others, last = fit.kinds
@@ -57,42 +57,42 @@ def refitted(misfit: WeightedMisfit, fit: EffectFit) -> EffectFit:
         lower=fit.lower[:n],
         upper=fit.upper[:n],
     )
-    begun = candidate(last, scales_of(misfit.predictions))._replace(starts=(fit.of_kind(last),))
-    return fit_effect(misfit, begun, before)
+    start = candidate(last, scales_of(misfit.predictions))._replace(starts=(fit.of_kind(last),))
+    return fit_effect(misfit, start, before)
 
 
 def refined(
     data: SteadyStates, misfit: WeightedMisfit, fit: EffectFit
 ) -> tuple[WeightedMisfit, EffectFit]:
-    """A fit again where the records are corrected for the errors that it finds in them.
+    """Refit with the records corrected for the errors that the fit itself estimates.
 
-    From where it is, and, unless that explains them, from the records as they are: smooth
-    curves may miss a kink.
+    Starts from the current corrections and, unless that fits, also from the uncorrected records:
+    the first corrections are those of smooth curves, which may miss a corner of the law.
     """
-    found = _corrected(data, misfit, fit)
-    if found is not None and found[1].p_value > priors.REJECTED:
-        return found
+    corrected = _corrected(data, misfit, fit)
+    if corrected is not None and corrected[1].p_value > priors.REJECTED:
+        return corrected
     none = np.zeros_like(misfit.predictions.added)
     plain = without_errors(misfit, fit, data, none)
     other = _corrected(data, plain, refitted(plain, fit))
-    both = [pair for pair in (found, other) if pair is not None]
+    both = [pair for pair in (corrected, other) if pair is not None]
     return min(both, key=lambda pair: pair[1].chi_square, default=(misfit, fit))
 
 
 def _corrected(
     data: SteadyStates, misfit: WeightedMisfit, fit: EffectFit
 ) -> tuple[WeightedMisfit, EffectFit] | None:
-    """The fit where nothing moves any more; None where no errors explain the records."""
-    moved, straight = np.inf, 0.003  # relative or rad
+    """The fit with converged corrections; None where no plausible errors explain the records."""
+    change, tolerance = np.inf, 0.003  # relative or rad
     for _ in range(6):
         if not np.isfinite(fit.chi_square):
             return None
         added = likely_errors(misfit, fit.rows)
         if np.max(np.abs(added), initial=0.0) > priors.FARTHEST_ERROR:
             return None
-        moved = np.max(np.abs(added - misfit.predictions.added), initial=0.0)
-        if moved < straight:
+        change = np.max(np.abs(added - misfit.predictions.added), initial=0.0)
+        if change < tolerance:
             return misfit, fit
         misfit = without_errors(misfit, fit, data, added)
         fit = refitted(misfit, fit)
-    return (misfit, fit) if moved < priors.SETTLED_ERROR else None
+    return (misfit, fit) if change < priors.SETTLED_ERROR else None

@@ -1,4 +1,4 @@
-"""The measurement that a diagnosis asks for, as steady states to be measured."""
+"""The measurement that a diagnosis recommends, as steady states to be measured."""
 
 from typing import NamedTuple
 
@@ -11,30 +11,30 @@ from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates, relative_errors,
 
 
 class MeasurementPlan(NamedTuple):
-    """Steady states to be measured: frequencies and forces are set, velocities are expected ones.
+    """Steady states to be measured: prescribed frequencies and forces, expected velocities.
 
-    `states` have levels of their own, since errors of gain and phase are those of a session, and
-    the errors of the former test as far as these were stated.
+    `states` have new levels, since gain and phase errors belong to a session, and the errors of
+    the former test where these were stated.
     """
 
     states: SteadyStates
-    harmonics: tuple[int, ...]  # that are to be recorded
-    harmonic_std: float | None  # m/s, noise of harmonics that the plan relies on
+    harmonics: tuple[int, ...]  # to be recorded
+    harmonic_std: float | None  # m/s, noise of harmonics that the plan requires
 
 
 def measurement_plan(diagnosis: Diagnosis) -> MeasurementPlan | None:
-    """What to measure so that an open diagnosis is decided; None where no steady state can do so.
+    """Steady states that would decide an open diagnosis; None where none can.
 
-    The test of `decide_by`, where one was compared. Otherwise, where something is open, the
-    largest level again with the harmonics that were not recorded; where they were, a smaller and a
-    larger level. None for an answer that nothing contradicts, and where a calibration decides.
+    The test of `decide_by`, if one was computed. Otherwise, if the answer is open, the largest
+    level again with the harmonics that were not recorded or, if they were, a smaller and a larger
+    level. None if nothing is open, and where only a calibration decides.
     """
     test, data = diagnosis.discriminating_test, diagnosis.data
     known = tuple(order for order in data.harmonic_order if order in COMPARED)
     if test is not None and test.planned is not None:
-        asked = test.harmonics or known
+        orders = test.harmonics or known
         parts = [(test.planned.frequency, test.planned.force, test.planned.velocity)]
-        return MeasurementPlan(_states(diagnosis, parts), asked, test.harmonic_std)
+        return MeasurementPlan(_states(diagnosis, parts), orders, test.harmonic_std)
     is_open = diagnosis.verdict in (Verdict.AMBIGUOUS, Verdict.UNKNOWN)
     if not is_open or diagnosis.decide_by is None or test is not None:
         return None
@@ -56,7 +56,7 @@ _Part = tuple[np.ndarray, np.ndarray, np.ndarray]  # frequency, force, velocity
 
 
 def _of_level(diagnosis: Diagnosis, number: int, scale: float = 1.0) -> _Part:
-    """Some states of a level, from low to high frequency, at forces so many times larger."""
+    """Up to 24 states of a level by increasing frequency, with force and velocity scaled."""
     data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
     rows = np.flatnonzero(np.asarray(data.level) == number)
     rows = rows[np.argsort(np.asarray(data.frequency)[rows], kind="stable")]
@@ -66,7 +66,7 @@ def _of_level(diagnosis: Diagnosis, number: int, scale: float = 1.0) -> _Part:
 
 
 def _states(diagnosis: Diagnosis, parts: list[_Part]) -> SteadyStates:
-    """Planned states, each part as a level of its own, with errors as large as before."""
+    """Planned states, each part a level of its own, with the errors of the former test."""
     data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
     frequency, force, speed = (np.concatenate(column) for column in zip(*parts, strict=True))
     first = int(np.asarray(data.level).max()) + 1

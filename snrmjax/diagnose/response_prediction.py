@@ -1,4 +1,4 @@
-"""Responses that models predict under the forces of a test, and the forces that hold a velocity."""
+"""Responses predicted at the force levels of a test, and forces for a constant velocity."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,26 +22,26 @@ from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
 
 _HERTZ = 2 * np.pi
-_MOST_LEVELS = 12  # whose responses are simulated
+_MOST_LEVELS = 12  # to be simulated
 
 
 class PhaseResonance(NamedTuple):
-    """Where a response is in phase with its force; NaN where there is no such state."""
+    """Phase resonance: velocity in phase with the force; NaN where there is none."""
 
     frequency: float  # Hz
     velocity: float  # m/s
-    fold: float = np.nan  # Hz, of the branch that ends nearest above
-    jump: tuple[float, float] | None = None  # Hz, between which measured states jump past it
+    fold: float = np.nan  # Hz, fold nearest to the resonance
+    jump: tuple[float, float] | None = None  # Hz, ends of a jump of the measured states past it
 
 
 _NOWHERE = PhaseResonance(np.nan, np.nan)
 
 
 class LevelResponse(NamedTuple):
-    """A level's measured resonance and those that models predict.
+    """A level's measured and predicted resonances.
 
-    `after` is that of the completed model or, of a level with `held_out`, of the model that was
-    completed without it; `completed` is that of the completed model in either case.
+    `after` is that of the completed model or, for a withheld level (`held_out`), of the model that
+    was completed without it; `completed` is that of the completed model in either case.
     """
 
     level: int
@@ -49,24 +49,24 @@ class LevelResponse(NamedTuple):
     measured: PhaseResonance
     before: PhaseResonance
     after: PhaseResonance
-    held_out: bool  # whether the model of `after` was not fitted to the level
+    held_out: bool  # withheld: the model of `after` was not fitted to the level
     complete: bool = True  # whether both responses were traced to the end of the range
     completed: PhaseResonance = _NOWHERE  # of the model fitted to all levels
 
 
 class LevelPredictions(NamedTuple):
-    """Resonances of every level, and the responses that were simulated under their forces."""
+    """Resonances of every level, and the responses simulated at their forces."""
 
     levels: list[LevelResponse]
-    before: list[ResponseCurve]  # of the model as given
-    after: list[ResponseCurve]  # of the completed one
+    before: list[ResponseCurve]  # of the given model
+    after: list[ResponseCurve]  # of the completed model
 
 
 @on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
 def predict_levels(diagnosis: Diagnosis, model: Structure) -> LevelPredictions:
-    """Simulates every level's response with the model as given and with the completed one.
+    """Simulate the response at every level's force with the given and the completed model.
 
-    Arguments: `model` as it was diagnosed. Raises `ValueError` where there is no completed model.
+    Arguments: `model`: the one diagnosed. Raises `ValueError` where there is no completed model.
     Not differentiable: differentiate the force that a motion needs:
     `snrmjax.identify.inverse_force`.
     """
@@ -90,26 +90,25 @@ def predicted_levels(
     without_level: Mapping[int, Structure] = MappingProxyType({}),
     force_gain: float = 1.0,
 ) -> LevelPredictions:
-    """Measured and predicted resonances of every level, under the levels' forces.
+    """Measured and predicted resonances of every level, at the levels' forces.
 
-    Of more than 12 levels some are simulated. A level that was left out of the fit is predicted by
-    the model completed without it; `force_gain` is acting force over recorded one for the completed
-    models. One program follows all responses: in the model before the effects are there without
-    strength.
+    At most 12 levels are simulated, in addition to those of `without_level`: withheld levels, which
+    the models completed without them predict. `force_gain` is acting over recorded force for the
+    completed models. The given model has the effects at zero strength: one program traces all.
     """
     forces = _spread(level_forces(data, sensor), {*without_level})
-    n, seen = len(forces), [level for level in forces if level in without_level]
+    n, chosen = len(forces), [level for level in forces if level in without_level]
     modes, j = model.modes, model.modes.mode_of_interest
     mode = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
     idle = tuple(e.idle(*mode) for e in completed.effects[len(model.effects) :])
     given = dataclasses.replace(model, effects=(*model.effects, *idle))
-    models = [given] * n + [completed] * n + [without_level[level] for level in seen]
-    acting = [force_gain * force for force in (*forces.values(), *(forces[k] for k in seen))]
+    models = [given] * n + [completed] * n + [without_level[level] for level in chosen]
+    acting = [force_gain * force for force in (*forces.values(), *(forces[k] for k in chosen))]
     simulated = responses(models, data, [*forces.values(), *acting])
-    held_out, rows = dict(zip(seen, simulated[2 * n :], strict=True)), []
+    withheld, rows = dict(zip(chosen, simulated[2 * n :], strict=True)), []
     for k, (level, force) in enumerate(forces.items()):
         before, after = simulated[k], simulated[n + k]
-        best = held_out.get(level, after)
+        best = withheld.get(level, after)
         rows.append(
             LevelResponse(
                 level,
@@ -117,7 +116,7 @@ def predicted_levels(
                 measured_resonance(data, level, sensor),
                 simulated_resonance(before, sensor),
                 simulated_resonance(best, sensor),
-                level in held_out,
+                level in withheld,
                 _complete(before) and _complete(best),
                 simulated_resonance(after, sensor),
             )
@@ -127,19 +126,19 @@ def predicted_levels(
 
 
 def _spread(forces: dict[int, float], kept: set[int]) -> dict[int, float]:
-    """Of many levels some, from the smallest to the largest force, and those that are kept."""
+    """At most 12 levels, evenly spaced in rank of force, and those in `kept`."""
     ranked = sorted(forces, key=forces.__getitem__)
-    places = np.linspace(0, len(ranked) - 1, min(len(ranked), _MOST_LEVELS)).round().astype(int)
-    some = {ranked[place] for place in places} | kept
+    ranks = np.linspace(0, len(ranked) - 1, min(len(ranked), _MOST_LEVELS)).round().astype(int)
+    some = {ranked[rank] for rank in ranks} | kept
     return {level: force for level, force in forces.items() if level in some}
 
 
 def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
-    """Force of every level that has a known one, N: at resonance, where its states enclose it.
+    """Force of every level where known, N: at resonance, if its states bracket it, else the mean.
 
-    A test that holds the response changes the force along a level; elsewhere it is their mean.
-    Where states jump past the resonance it is that of the last one before the jump.
-    Without phases it is that of the state with the largest velocity over force.
+    It varies along a level of a response-controlled test. Where states jump past the resonance it
+    is that of the last state before the jump; without phases, that of the state with the largest
+    velocity over force.
     """
     level, force = np.asarray(data.level), np.asarray(data.force)
     velocity = np.asarray(data.velocity)[:, sensor]
@@ -163,10 +162,10 @@ def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
 
 
 def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseResonance:
-    """By interpolation between the states on both sides; NaN where one is empty or they jump.
+    """Interpolated between states on both sides; NaN if one side is empty or at a jump.
 
-    Frequency against tan φ and |V|/cos φ against φ, which along a resonance change least. Without
-    phases the state with the largest velocity over force is taken, if others enclose it.
+    Interpolates frequency over tan φ and |V|/cos φ over φ, both smooth along a resonance. Without
+    phases it is the state with the largest velocity over force, if others bracket it.
     """
     velocity, frequency = np.asarray(data.velocity)[:, sensor], np.asarray(data.frequency)
     rows = (np.asarray(data.level) == level) & np.isfinite(np.abs(velocity))
@@ -179,49 +178,49 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseReso
         return _NOWHERE  # the phase was controlled: every state is a resonance
     rows = np.flatnonzero(rows & (velocity.real > 0))
     rows = rows[np.argsort(np.angle(velocity[rows]), kind="stable")]
-    phase, size, frequency = np.angle(velocity[rows]), np.abs(velocity[rows]), frequency[rows]
+    phase, speed, frequency = np.angle(velocity[rows]), np.abs(velocity[rows]), frequency[rows]
     if not rows.size or phase[0] > 0 or phase[-1] < 0:
         return _NOWHERE
     jump = jump_at_resonance(np.tan(phase), frequency)
     if jump is not None:
         return _NOWHERE._replace(jump=(jump[0] / _HERTZ, jump[1] / _HERTZ))
     at = np.interp(0.0, np.tan(phase), frequency)
-    tip = np.interp(0.0, phase, size / np.cos(phase))
+    tip = np.interp(0.0, phase, speed / np.cos(phase))
     return PhaseResonance(float(at) / _HERTZ, float(tip))
 
 
 def _largest(data: SteadyStates, rows: np.ndarray, sensor: int) -> int:
-    """Of some states the one with the largest velocity over force."""
+    """Row, among some, with the largest velocity over force."""
     ratio = np.abs(np.asarray(data.velocity)[:, sensor]) / np.asarray(data.force)
     return int(np.argmax(np.where(rows & np.isfinite(ratio), ratio, -np.inf)))
 
 
 def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> PhaseResonance:
-    """The strongest phase resonance of a response: of the velocity that a sensor records."""
-    found = [(*crossing, curve) for curve in curves for crossing in _in_phase(curve, sensor)]
-    if not found:
+    """The phase resonance with the largest velocity at a sensor."""
+    crossings = [(*crossing, curve) for curve in curves for crossing in _in_phase(curve, sensor)]
+    if not crossings:
         return _NOWHERE
-    size, frequency, curve = max(found, key=lambda crossing: crossing[0])
+    speed, frequency, curve = max(crossings, key=lambda crossing: crossing[0])
     folds, fold = curve.at_events("fold"), np.nan
     if folds.size:
         tips = np.abs(curve.velocity[folds, 1, sensor])
         fold = float(curve.frequency[folds[np.argmax(tips)]]) / _HERTZ
-    return PhaseResonance(frequency / _HERTZ, size, fold)
+    return PhaseResonance(frequency / _HERTZ, speed, fold)
 
 
 def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
-    """Velocities (m/s) and frequencies (rad/s) where a sensor's velocity has the force's phase."""
+    """Velocities (m/s) and frequencies (rad/s) where a sensor is in phase with the force."""
     velocity, frequency = np.asarray(curve.velocity)[:, 1, sensor], np.asarray(curve.frequency)
     real, imag = velocity.real, velocity.imag
-    turns = (imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:])
-    k = np.flatnonzero(turns & (real[:-1] > 0) & (real[1:] > 0))
+    sign_change = (imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:])
+    k = np.flatnonzero(sign_change & (real[:-1] > 0) & (real[1:] > 0))
     fraction = imag[k] / (imag[k] - imag[k + 1])
     columns = ((1 - fraction) * of[k] + fraction * of[k + 1] for of in (real, frequency))
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def _complete(curves: Sequence[ResponseCurve]) -> bool:
-    """Whether a curve of a response goes through the whole range of frequencies."""
+    """Whether the main branch of a response was traced to the upper end of the range."""
     return any(
         curve.branch == Branch.MAIN and curve.status == CurveStatus.UPPER_END for curve in curves
     )
@@ -230,9 +229,9 @@ def _complete(curves: Sequence[ResponseCurve]) -> bool:
 def responses(
     models: Structure | Sequence[Structure], data: SteadyStates, forces: Sequence[float]
 ) -> list[list[ResponseCurve]]:
-    """Simulated responses around the measured frequencies, force by force (N), as recorded.
+    """Simulated responses around the measured frequencies at each force (N), as recorded.
 
-    `models` is one for all forces or one for each, with the same kinds of effects.
+    `models`: one for all forces, or one for each with the same kinds of effects.
     """
     frequency = np.asarray(data.frequency)
     reach = 0.3 * (frequency.max() - frequency.min())
@@ -244,22 +243,21 @@ def responses(
     return [recorded_curves(*pair) for pair in zip(each, batch.curves, strict=True)]
 
 
-class HeldCurve(NamedTuple):
-    """The force that holds one velocity amplitude, over frequency."""
+class ControlledVelocityCurve(NamedTuple):
+    """The force at a constant velocity amplitude, over frequency."""
 
     level: int
     velocity: float  # m/s
     frequency: np.ndarray  # rad/s
-    force: np.ndarray  # N; NaN where no motion was found
+    force: np.ndarray  # N; NaN without convergence
 
 
-def held_curves(
+def controlled_velocity_curves(
     model: Structure, data: SteadyStates, sensor: int, force_gain: float = 1.0
-) -> list[HeldCurve]:
-    """Forces with which a model holds every level's median velocity, by inverse harmonic balance.
+) -> list[ControlledVelocityCurve]:
+    """Recorded forces for every level's median velocity, by inverse harmonic balance.
 
-    Arguments: `sensor` whose velocity is held; `force_gain` is acting over recorded force, where
-    the answer is the recorded one.
+    Arguments: `sensor`: whose velocity is controlled; `force_gain`: acting over recorded force.
     """
     level, omega = np.asarray(data.level), np.asarray(data.frequency)
     speed, force = np.abs(np.asarray(data.velocity))[:, sensor], np.asarray(data.force)
@@ -270,49 +268,51 @@ def held_curves(
         at = np.linspace(omega[rows].min(), omega[rows].max(), n)
         columns = (number, at, np.median(force[rows]), np.median(speed[rows]))
         parts.append(np.broadcast_arrays(*columns))
-    of, at, load, held = (np.concatenate(column) for column in zip(*parts, strict=True))
-    seen = np.arange(len(data.sensors)) == sensor
+    levels, at, load, constant = (np.concatenate(column) for column in zip(*parts, strict=True))
+    mask = np.arange(len(data.sensors)) == sensor
     states = steady_states(
-        of,
+        levels,
         at,
         load,
-        held[:, None] * seen + 0j,
+        constant[:, None] * mask + 0j,
         sensors=data.sensors,
-        measured=np.tile(seen, (len(of), 1)),
+        measured=np.tile(mask, (len(levels), 1)),
         base=data.base,
     )
     needed = np.abs(np.asarray(inverse_force(model, states, harmonic_order=5).force)) / force_gain
     return [
-        HeldCurve(int(of[k]), float(held[k]), at[k : k + n], needed[k : k + n])
-        for k in range(0, len(of), n)
+        ControlledVelocityCurve(
+            int(levels[k]), float(constant[k]), at[k : k + n], needed[k : k + n]
+        )
+        for k in range(0, len(levels), n)
     ]
 
 
 def at_curve_force(data: SteadyStates, forces: Iterable[float]) -> np.ndarray:
-    """Which steady states were measured within 5 % of one of some forces (N), or of none known."""
+    """Mask of states within 5 % of one of some forces (N), or of unknown force."""
     force, each = np.asarray(data.force), np.asarray(list(forces))
-    away = np.min(np.abs(force[:, None] / each - 1.0), axis=1)
-    return ~(away > priors.SAME_FORCE)
+    distance = np.min(np.abs(force[:, None] / each - 1.0), axis=1)
+    return ~(distance > priors.SAME_FORCE)
 
 
-def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
-    """Whether the levels of a test hold the response: its force changes, more than velocity.
+def is_response_controlled(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
+    """Whether a test is response-controlled: its force varies more than its velocity.
 
-    A shaker's force that drops at resonance changes too, but the velocity does far more.
+    A shaker's force drop at resonance also varies the force, but the velocity far more.
     """
     if not predicted:
         return False
     same = at_curve_force(data, [one.force for one in predicted])
-    if not np.mean(~same) > priors.HELD_RESPONSE:
+    if not np.mean(~same) > priors.RESPONSE_CONTROLLED:
         return False
-    # Ranges of the logarithm between the first and last tenth, at the sensor that moves most.
-    size = np.abs(np.asarray(data.velocity)) * np.asarray(data.measured)
-    speed, force = size[:, int(np.argmax(size.mean(axis=0)))], np.asarray(data.force)
+    # Ranges of the logarithm from the 10 to the 90 % quantile, at the sensor with most motion.
+    speeds = np.abs(np.asarray(data.velocity)) * np.asarray(data.measured)
+    speed, force = speeds[:, int(np.argmax(speeds.mean(axis=0)))], np.asarray(data.force)
     good, level = (speed > 0) & (force > 0), np.asarray(data.level)
 
     def spread(of: np.ndarray, rows: np.ndarray) -> float:
         return float(np.ptp(np.quantile(np.log(of[rows]), (0.1, 0.9))))
 
     levels = [good & (level == number) for number in np.unique(level[good])]
-    # Where both change, as at phase resonance, the test holds neither.
+    # Where both vary, as in phase-resonance tests, neither is controlled.
     return bool(np.median([2 * spread(speed, rows) - spread(force, rows) for rows in levels]) < 0)

@@ -1,10 +1,10 @@
-"""What a diagnosis says as a whole, and how answers are named."""
+"""Verdicts of a diagnosis, and how answers are named."""
 
 from collections.abc import Iterable
 from enum import StrEnum
 
 Kinds = tuple[str, ...]
-"""An answer: its effects in alphabetic order, or one of those without any."""
+"""An answer: its effects in alphabetical order, or one of those without any."""
 
 NONE: Kinds = ("none",)
 UNKNOWN: Kinds = ("unknown",)
@@ -12,7 +12,7 @@ NOISE_REJECTED: Kinds = ("noise_rejected",)
 
 
 class Verdict(StrEnum):
-    """What a diagnosis says as a whole."""
+    """The overall result of a diagnosis."""
 
     NOTHING_MISSING = "none"
     NAMED = "named"
@@ -28,5 +28,5 @@ class Verdict(StrEnum):
 
 
 def answer_of(effects: Iterable[str]) -> Kinds:
-    """The answer of effects in any order, and of none."""
+    """The answer with these effects, in any order; `NONE` without any."""
     return tuple(sorted(effects)) or NONE

@@ -1,6 +1,6 @@
-"""The import doctor: errors of import and of the test, found before anything is identified.
+"""The import doctor: errors of import and of the test, detected before identification.
 
-`check_test` looks at tables of steady states, the linear model and time records.
+`check_test` checks tables of steady states, the linear model and time records.
 """
 
 import lazy_loader

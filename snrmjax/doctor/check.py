@@ -1,4 +1,4 @@
-"""The import doctor: looks at tables, model and time records before anything is identified."""
+"""The import doctor: checks tables, model and time records before identification."""
 
 from collections.abc import Sequence
 
@@ -15,6 +15,7 @@ from snrmjax.doctor.fitted_hypothesis import (
     usable_rows,
 )
 from snrmjax.doctor.force_checks import deepest_fall, dropout_findings, harmonic_findings
+from snrmjax.doctor.interpretations import OPPOSITE, best_interpretation, misread
 from snrmjax.doctor.priors import (
     FEWEST_STATES,
     FITS_WELL,
@@ -23,7 +24,6 @@ from snrmjax.doctor.priors import (
     MOVED_MATTERS,
     OTHER_RANGE,
 )
-from snrmjax.doctor.readings import OPPOSITE, best_reading, misread
 from snrmjax.doctor.record_checks import record_findings
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -41,21 +41,21 @@ def check_test(
 ) -> Checkup:
     """Find errors of import and of the test in tables and records, before identification.
 
-    Near resonance a single mode obeys iΩAF/V = κ(K(a) − Ω² + iΩδ(a)) with smooth curves of the
-    displacement amplitude, whatever they are. Each thing that the columns may be taken for, or that
-    may have gone wrong with the test, is undone and judged by the same posterior as the table as it
-    is (`identify.test_model`): it is named only where one mode fits then, and clearly not as
-    recorded. Records are looked at step by step: limits, transients, harmonics, folded frequencies.
+    Near resonance a single mode obeys iΩAF/V = κ(K(a) − Ω² + iΩδ(a)) with any smooth curves of
+    the displacement amplitude. Each possible misreading of a column or error of the test is
+    corrected, and the corrected table is fitted with the same posterior as the recorded one
+    (`identify.test_model`): it is reported only if one mode fits then, and clearly not as recorded.
+    Records are checked step by step: clipping, transients, harmonics, aliases.
 
-    Arguments: `tables` of one structure, each a test of its own (in the order of time); `model` as
-    for identification, without which scales and the model's frequency are not looked at;
+    Arguments: `tables` of one structure, each a separate test (in order of time); `model` as
+    for identification, without which scales and the model's frequency are not checked;
     `recordings` of the same test.
     Returns `Checkup`: `.findings`, each with kind, severity ("error", "warning", "info"), where,
-    evidence and what mends it; none where all is well; `.notes` on what could not be looked at.
-    Raises `ValueError` for nothing to look at and for tables of different sensors.
+    evidence and remedy; none where all is well; `.notes` on what could not be checked.
+    Raises `ValueError` without tables and recordings, and for tables of different sensors.
     Validity: one well-separated mode and tests near its resonance; at least eight states. A
-    factor of the force and the same one of the modal mass look alike in one table: both are named
-    then.
+    factor of the force and the same factor of the modal mass are equivalent in one table: both are
+    reported then.
     Not differentiable: differentiate `snrmjax.identify.identify_points`.
 
     >>> from snrmjax.measure import steady_states
@@ -67,21 +67,21 @@ def check_test(
     given = [tables] if isinstance(tables, SteadyStates) else list(tables)
     if not given and not recordings:
         raise ValueError("there is nothing to check: give a table or a recording.")
-    found: list[Finding] = []
+    findings: list[Finding] = []
     notes: list[Fact] = []
     if given:
         parts, groups = files_of_levels(given)
         data = parts[0] if len(parts) == 1 else join_steady_states(parts)
-        found += _of_table(data, model, groups if len(parts) > 1 else (), notes)
+        findings += _of_table(data, model, groups if len(parts) > 1 else (), notes)
         if model is None:
             notes.append(Fact("no_model"))
     else:
         notes.append(Fact("no_table"))
     for recording in recordings:
         of_record, unseen = record_findings(recording)
-        found += of_record
+        findings += of_record
         notes += unseen
-    return Checkup(gravest_first(found), tuple(dict.fromkeys(notes)))
+    return Checkup(gravest_first(findings), tuple(dict.fromkeys(notes)))
 
 
 def _of_table(
@@ -101,100 +101,100 @@ def _of_table(
     drive = bool(np.all(np.isnan(np.asarray(data.force)[rows])))
     if drive:
         notes.append(Fact("drive_not_scaled"))
-    seen = checked_states(data, model, sensor, rows, groups)
-    found, fit = mode_findings(seen, model, where, drive)
-    found += dropout_findings(seen, where)
-    if data.harmonic_order and not any(one.severity == "error" for one in found):
-        found += harmonic_findings(data, seen, fit, model, sensor, where)
-    return found
+    checked = checked_states(data, model, sensor, rows, groups)
+    findings, fit = mode_findings(checked, model, where, drive)
+    findings += dropout_findings(checked, where)
+    if data.harmonic_order and not any(one.severity == "error" for one in findings):
+        findings += harmonic_findings(data, checked, fit, model, sensor, where)
+    return findings
 
 
 def mode_findings(
-    seen: CheckedStates, model: Structure | None, where: str, drive: bool
+    checked: CheckedStates, model: Structure | None, where: str, drive: bool
 ) -> tuple[list[Finding], FittedHypothesis]:
-    """Findings of one sensor's states, and how they fit with those undone.
+    """Findings of one sensor's states, and the fit with these errors corrected.
 
-    `drive` says that forces are declared to be volts: then their scale and phase say nothing.
+    `drive`: the force column is declared as volts, so that its scale and phase are unknown.
     """
     scaled = model is not None and not drive  # whether the modal mass is known
-    recorded, best = best_reading(seen, scaled)
-    found: list[Finding] = []
-    # Without a model nobody said which way the sensor moves for a force.
+    recorded, best = best_interpretation(checked, scaled)
+    findings: list[Finding] = []
+    # Without a model the sign of the sensor relative to the force is unknown.
     unsigned = model is None and best.meaning is OPPOSITE
     if best is not recorded and not drive and not unsigned:
-        found.append(misread(recorded.judged, best, where))
+        findings.append(misread(recorded.fit, best, where))
         if best.meaning.kind == "degrees_for_radians":
-            return found, best.judged
-    base, scale, first = best.as_modelled or best.judged, best.scale, None
+            return findings, best.fit
+    base, scale, first = best.as_modelled or best.fit, best.scale, None
     if model is not None and scaled and scale is not None and is_other_scale(scale, base):
-        # Something is wrong; what bends a test may pass for another modal mass.
-        first = _likeliest(seen, base)
-        if first is None or not first.judged.is_likelier(scale.judged):
-            found += scale_findings(scale, base, model, where)
-            base, first = scale.judged, None
+        # An error of the test may also appear as another modal mass.
+        first = _likeliest(checked, base)
+        if first is None or not first.fit.is_likelier(scale.fit):
+            findings += scale_findings(scale, base, model, where)
+            base, first = scale.fit, None
     if first is None:
-        first = _likeliest(seen, base)
-        first = first if first is not None and _beats(seen, first, base) else None
-    plain = all(one.kind in ("rms_for_peak", "shape_not_mass_normalised") for one in found)
+        first = _likeliest(checked, base)
+        first = first if first is not None and _beats(checked, first, base) else None
+    plain = all(one.kind in ("rms_for_peak", "shape_not_mass_normalised") for one in findings)
     if first is not None:
-        found.append(_finding(seen, base, first, where))
-        base = first.judged
+        findings.append(_finding(checked, base, first, where))
+        base = first.fit
     if model is not None and not drive and plain:
-        found += shaker_damping(base, model, where)
-    return found, base
+        findings += shaker_damping(base, model, where)
+    return findings, base
 
 
-def _likeliest(seen: CheckedStates, base: FittedHypothesis) -> TestCorrection | None:
-    """The likeliest correction that matters."""
-    tried = (one for one in corrections(seen, base.states, base) if one.judged.leaves_less(base))
-    best = max(tried, key=lambda one: one.judged.evidence, default=None)
+def _likeliest(checked: CheckedStates, base: FittedHypothesis) -> TestCorrection | None:
+    """The most likely correction, if it is relevant."""
+    tried = (one for one in corrections(checked, base.states, base) if one.fit.leaves_less(base))
+    best = max(tried, key=lambda one: one.fit.evidence, default=None)
     return best if best is not None and _matters(best, base) else None
 
 
-def _beats(seen: CheckedStates, one: TestCorrection, base: FittedHypothesis) -> bool:
-    """Whether a correction beats the table as it is read."""
-    if one.kind == "force_dropout":  # the noise of a cell is no misfit
-        return one.judged.noise < FITS_WELL and one.judged.explains(base)
-    most = not base.damped or one.judged.misfit**2 < MOST_OF_MISFIT * base.misfit**2
-    if not (most and one.judged.beats(base)):
+def _beats(checked: CheckedStates, one: TestCorrection, base: FittedHypothesis) -> bool:
+    """Whether a correction is clearly more likely than the table as it is interpreted."""
+    if one.kind == "force_dropout":  # noise of a force cell is no misfit
+        return one.fit.noise < FITS_WELL and one.fit.explains(base)
+    most = not base.damped or one.fit.misfit**2 < MOST_OF_MISFIT * base.misfit**2
+    if not (most and one.fit.beats(base)):
         return False
-    other = sweeps_apart(seen, base.states, base) if one.kind == "drift" else None
-    return other is None or one.judged.is_likelier(other)
+    other = sweeps_apart(checked, base.states, base) if one.kind == "drift" else None
+    return other is None or one.fit.is_likelier(other)
 
 
 def _matters(one: TestCorrection, base: FittedHypothesis) -> bool:
-    """Whether a correction is large enough to be spoken of."""
+    """Whether a correction is large enough to be reported."""
     if one.kind in ("drift", "different_structures"):
-        width = float(np.median(one.judged.damping / base.states.frequency))
+        width = float(np.median(one.fit.damping / base.states.frequency))
         return abs(one.value) > MOVED_MATTERS * width
     if one.kind == "volts_as_force":
         gains = np.array(one.gains)
         off = np.sort(np.abs(gains - np.median(gains)))
         flattened = base.fits and off[-2] > OTHER_RANGE
         return float(np.ptp(gains)) > GAIN_MATTERS and not flattened
-    # A force that lies within the noise of its cell is none.
+    # A force below the noise of its cell cannot be corrected.
     return one.kind != "force_dropout" or one.value < base.states.force.min()
 
 
 def _finding(
-    seen: CheckedStates, base: FittedHypothesis, one: TestCorrection, where: str
+    checked: CheckedStates, base: FittedHypothesis, one: TestCorrection, where: str
 ) -> Finding:
-    """What a correction undoes, as a finding."""
+    """The error that a correction removes, as a finding."""
     states = base.states
-    misses = {"misfit": one.judged.misfit, "misfit_before": base.misfit}
+    misfits = {"misfit": one.fit.misfit, "misfit_before": base.misfit}
     rows: tuple[int, ...] = ()
     title = None
     match one.kind:
         case "drift":
-            evidence, advice = Fact("drift", change=one.value, **misses), Fact("advice_drift")
+            evidence, advice = Fact("drift", change=one.value, **misfits), Fact("advice_drift")
         case "different_structures":
-            n = len(seen.files)
+            n = len(checked.files)
             evidence = Fact(
-                "structures_differ", file=one.file, change=one.value, n_files=n, **misses
+                "structures_differ", file=one.file, change=one.value, n_files=n, **misfits
             )
             advice = Fact("advice_structures")
         case "volts_as_force":
-            evidence, advice, title = _of_gains(one, misses, seen.files)
+            evidence, advice, title = _of_gains(one, misfits, checked.files)
         case "force_dropout":
             advice = Fact("advice_force_in_noise")
             evidence = Fact(
@@ -204,31 +204,35 @@ def _finding(
                 smallest=float(states.force.min()),
             )
         case "unsettled_steps":
-            evidence = Fact("states_unsettled", fraction=one.value, **misses)
+            evidence = Fact("states_unsettled", fraction=one.value, **misfits)
             advice = Fact("advice_unsettled")
         case _:
-            size = states.force if one.column == "force" else np.abs(states.velocity)
-            rows = tuple(int(seen.row[k]) for k in np.flatnonzero(size > one.value * 0.999))
+            amplitude = states.force if one.column == "force" else np.abs(states.velocity)
+            rows = tuple(int(checked.row[k]) for k in np.flatnonzero(amplitude > one.value * 0.999))
             advice, limited = Fact("advice_clipped_states"), {"column": one.column, "rows": rows}
-            evidence = Fact("states_clipped", limit=one.value, **limited, **misses)
+            evidence = Fact("states_clipped", limit=one.value, **limited, **misfits)
     return Finding(one.kind, where, evidence, advice, rows, title=title)
 
 
 def _of_gains(
-    one: TestCorrection, misses: dict[str, float], files: tuple[tuple[int, ...], ...]
+    one: TestCorrection, misfits: dict[str, float], files: tuple[tuple[int, ...], ...]
 ) -> tuple[Fact, Fact, Fact | None]:
-    """Forces whose scale is not the same at all levels; by number where a few of them are off."""
+    """Levels whose force scales differ; listed by number where only a few are off."""
     gains = np.array(one.gains)
     few = np.flatnonzero(np.abs(gains - np.median(gains)) > 0.5 * GAIN_MATTERS)
     if not len(few) or 2 * len(few) >= len(gains):
         factors = tuple(np.exp(gains[1:] - gains[0]).tolist())
-        return Fact("force_gains_differ", gains=factors, **misses), Fact("advice_force_gains"), None
+        return (
+            Fact("force_gains_differ", gains=factors, **misfits),
+            Fact("advice_force_gains"),
+            None,
+        )
     factors = np.exp(gains - np.median(np.delete(gains, few))).tolist()
     levels = tuple(
         (k + 1, files.index((k,)) + 1 if (k,) in files else None, factors[k]) for k in few.tolist()
     )
     return (
-        Fact("level_gains", gains=levels, **misses),
+        Fact("level_gains", gains=levels, **misfits),
         Fact("advice_level_gains", gains=levels),
         Fact("levels_on_another_scale", levels=tuple(level for level, *_ in levels)),
     )

@@ -1,4 +1,4 @@
-"""One thing at a time that may have gone wrong with a test, undone, and how one mode fits then."""
+"""Possible errors of a test, corrected one at a time, and the fit of one mode to each."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -26,82 +26,82 @@ from snrmjax.doctor.priors import (
 from snrmjax.identify.checks.residual_autocorrelation import states_of_levels
 from snrmjax.identify.test_model.states import TestStates
 
-_OWN_OF_CURVES = 2  # states, beyond which both curves' value and slope are no matter of a limit
-_LEVELS_GAIN = 0.02  # ln of what a limit takes from forces: cut more alike it is a gain of levels
-_SHORTEST_SWEEP = 3  # states, from one turn of the frequency to the next
-_LEFT = (0.2, 0.45, 0.7, 0.85)  # of what a step changes, at its end
+_OWN_OF_CURVES = 2  # clipped states needed: fewer are explained by value and slope of the curves
+_LEVELS_GAIN = 0.02  # spread of ln of the clipped force within a level; less is a gain of the level
+_SHORTEST_SWEEP = 3  # states, from one reversal of the frequency to the next
+_LEFT = (0.2, 0.45, 0.7, 0.85)  # remaining fraction of a step change, at its end
 
 
 class TestCorrection(NamedTuple):
-    """A table read with one thing undone."""
+    """A table with one error corrected."""
 
     kind: Kind
-    judged: FittedHypothesis
+    fit: FittedHypothesis
     value: float = np.nan  # its own parameter
-    gains: tuple[float, ...] = ()  # ln of each level's force over what it should be
-    file: int = 0  # that is of another structure, from 1
-    column: str = ""  # that is cut off: "response" or "force"
+    gains: tuple[float, ...] = ()  # ln of recorded over true force, for each level
+    file: int = 0  # with another structure, from 1
+    column: str = ""  # that is clipped: "response" or "force"
 
 
 def corrections(
-    seen: CheckedStates, states: TestStates, base: FittedHypothesis
+    checked: CheckedStates, states: TestStates, base: FittedHypothesis
 ) -> Iterator[TestCorrection]:
-    """Each correction with its likeliest parameter.
+    """Each correction with its most likely parameter.
 
-    Arguments: `states` as they are read; `base` how they fit.
+    Arguments: `states` as interpreted; `base` their fit.
     """
-    for k, levels in enumerate(seen.files):
-        if k > 0 or len(seen.files) > 2:  # of two the first differs as the second from it
+    for k, levels in enumerate(checked.files):
+        if k > 0 or len(checked.files) > 2:  # of two files only the second is tried
             member = np.isin(states.level, levels)
-            moved = _moving(states, base, member - float(np.mean(member)))
+            moved = _with_trend(states, base, member - float(np.mean(member)))
             yield TestCorrection("different_structures", *moved, file=k + 1)
     if base.misfit > NO_MODE:
         return
-    yield TestCorrection("drift", *_moving(states, base, seen.order - 0.5))
+    yield TestCorrection("drift", *_with_trend(states, base, checked.order - 0.5))
     gains = base.posterior.level_errors[:, 0]
     if states.n_levels > 1 and (base.misfit > SCATTER or np.ptp(gains) > GAIN_MATTERS):
         std = (OTHER_GAIN, *states.level_std[1:])
-        judged = _freer(states._replace(force_is_free=True, level_std=std), base)
-        gains = judged.posterior.level_errors[:, 0]
-        yield TestCorrection("volts_as_force", judged, gains=tuple(gains.tolist()))
+        fit = _with_more_unknowns(states._replace(force_is_free=True, level_std=std), base)
+        gains = fit.posterior.level_errors[:, 0]
+        yield TestCorrection("volts_as_force", fit, gains=tuple(gains.tolist()))
     yield from _clipped(states, base)
-    if not base.posterior.phase_is_controlled:  # a controller waits, and sets the force
-        yield from _unsettled(seen, states, base)
+    if not base.posterior.phase_is_controlled:  # a controller waits for the steady state
+        yield from _unsettled(checked, states, base)
         yield from _noisy_force(states, base)
 
 
-def _freer(states: TestStates, base: FittedHypothesis) -> FittedHypothesis:
-    """The fit of states with more that is unknown: anew, and from the fit without it on."""
+def _with_more_unknowns(states: TestStates, base: FittedHypothesis) -> FittedHypothesis:
+    """The fit of states with additional unknowns: from scratch, and starting at the fit without."""
     return likelier((fit_hypothesis(states), fit_hypothesis(states, start=base)))
 
 
-def _moving(
+def _with_trend(
     states: TestStates, base: FittedHypothesis, along: np.ndarray
 ) -> tuple[FittedHypothesis, float]:
-    """A natural frequency that changes in proportion to something, and by how much (relative)."""
-    judged = _freer(states._replace(trend=along, trend_std=MOVES), base)
-    stiffness = np.maximum(1 + judged.posterior.trend[0] * along, 1e-6)  # over the mean one
-    return judged, float(np.sqrt(stiffness[np.argmax(along)] / stiffness[np.argmin(along)])) - 1
+    """Fit with a natural frequency that varies along `along`, and its relative change."""
+    fit = _with_more_unknowns(states._replace(trend=along, trend_std=MOVES), base)
+    stiffness = np.maximum(1 + fit.posterior.trend[0] * along, 1e-6)  # over the mean one
+    return fit, float(np.sqrt(stiffness[np.argmax(along)] / stiffness[np.argmin(along)])) - 1
 
 
 def sweeps_apart(
-    seen: CheckedStates, states: TestStates, base: FittedHypothesis
+    checked: CheckedStates, states: TestStates, base: FittedHypothesis
 ) -> FittedHypothesis | None:
-    """The fit where what sweeps of a level differ by does not go with the time of the test.
+    """The best fit in which sweeps of a level differ for other reasons than a drift of the test.
 
-    They differ by their pace, by settling and by warmth that comes and goes: both directions by one
-    amount, all levels by a change that begins anew with each, or every sweep by its own error, as
-    levels do. None where each level was swept once.
+    Sweep rate, settling and transient warming make sweeps differ: by one amount between both
+    directions, by a change that restarts with each level, or by an independent error of each sweep.
+    None where each level was swept once.
     """
-    sweep, rising = sweeps(states.level, states.frequency, seen.order)
+    sweep, rising = sweeps(states.level, states.frequency, checked.order)
     if sweep.max() == states.level.max():
         return None
     parent = np.array([states.level[sweep == k][0] for k in range(sweep.max() + 1)])
     own = states._replace(level=sweep, level_std=(*states.level_std[:2], 0.0, states.level_std[3]))
     start = base._replace(posterior=base.posterior.beginning(parent))
-    middle = np.array([seen.order[states.level == k].mean() for k in range(states.n_levels)])
-    anew = seen.order - middle[states.level]
-    alike = (_moving(states, base, along)[0] for along in (rising, anew))
+    middle = np.array([checked.order[states.level == k].mean() for k in range(states.n_levels)])
+    anew = checked.order - middle[states.level]
+    alike = (_with_trend(states, base, along)[0] for along in (rising, anew))
     return likelier((*alike, fit_hypothesis(own, start=start)))
 
 
@@ -112,8 +112,8 @@ def sweeps(
 ) -> tuple[Int[np.ndarray, " state"], Float[np.ndarray, " state"]]:
     """The sweep of every state, counted from 0, and its direction: ½ upwards, −½ downwards.
 
-    A sweep ends where the frequency does not go on in its direction. Where one is then shorter than
-    three states, frequencies were not swept: the level is one part, without a direction.
+    A sweep ends where the frequency reverses. If one is then shorter than three states, frequencies
+    were not swept: the level is one part, without a direction.
     """
     sweep, rising = np.zeros(len(level), dtype=int), np.zeros(len(level))
     count = 0
@@ -136,7 +136,7 @@ def sweeps(
 
 
 class Tried(NamedTuple):
-    """One value of a correction's parameter."""
+    """One trial value of a correction's parameter."""
 
     value: float
     states: TestStates
@@ -144,10 +144,9 @@ class Tried(NamedTuple):
 
 
 def likeliest(base: FittedHypothesis, tried: Sequence[Tried]) -> tuple[float, FittedHypothesis]:
-    """The likeliest of several values, alike likely before, from what is nearest to the table as
-    it is on.
+    """The most likely of several values of equal prior probability, nearest to the recorded first.
 
-    Each fit goes on from the last; where one is clearly less likely, so are those beyond.
+    Each fit starts from the last; the search ends once one is clearly less likely.
     """
     value, best, last = np.nan, None, base
     for one in tried:
@@ -160,38 +159,38 @@ def likeliest(base: FittedHypothesis, tried: Sequence[Tried]) -> tuple[float, Fi
 
 
 def _clipped(states: TestStates, base: FittedHypothesis) -> Iterator[TestCorrection]:
-    """The response or the force cut off at a limit."""
-    size, force = np.abs(states.velocity), states.force
+    """The response or the force clipped at a limit."""
+    amplitude, force = np.abs(states.velocity), states.force
     limits = (0.96, 0.93, 0.9, 0.87, 0.84, 0.81)  # over the largest recorded fundamental
     tried = []
     for limit in limits:
-        true, stretch = unclipped(size, limit * size.max())
-        if np.sum(size > limit * size.max()) <= _OWN_OF_CURVES:
+        true, stretch = unclipped(amplitude, limit * amplitude.max())
+        if np.sum(amplitude > limit * amplitude.max()) <= _OWN_OF_CURVES:
             continue
         errors = states.errors.copy()
         errors[:, 1] *= stretch
-        moved = states._replace(velocity=states.velocity * true / size, errors=errors)
-        tried.append(Tried(limit, moved, float(np.sum(np.log(stretch)))))
-    value, judged = likeliest(base, tried)
+        corrected = states._replace(velocity=states.velocity * true / amplitude, errors=errors)
+        tried.append(Tried(limit, corrected, float(np.sum(np.log(stretch)))))
+    value, fit = likeliest(base, tried)
     if tried:
-        yield TestCorrection("clipped_channel", judged, value * size.max(), column="response")
+        yield TestCorrection("clipped_channel", fit, value * amplitude.max(), column="response")
     tried = []
     for limit in limits:
         true, _ = unclipped(force, limit * force.max())
         gain = np.log(true / force)
         if max(np.ptp(gain[states.level == k]) for k in range(states.n_levels)) > _LEVELS_GAIN:
             tried.append(Tried(limit, states._replace(force=true)))
-    value, judged = likeliest(base, tried)
+    value, fit = likeliest(base, tried)
     if tried:
-        yield TestCorrection("clipped_channel", judged, value * force.max(), column="force")
+        yield TestCorrection("clipped_channel", fit, value * force.max(), column="force")
 
 
 def unclipped(
     recorded: Float[np.ndarray, " state"], limit: float
 ) -> tuple[Float[np.ndarray, " state"], Float[np.ndarray, " state"]]:
-    """Amplitudes of sines whose fundamental was recorded behind a limit, and their stretch.
+    """True amplitudes of sines whose clipped fundamental was recorded, and their stretch.
 
-    The fundamental of a sine of amplitude a that is cut off at c is a(2/π)(asin s + s√(1 − s²)),
+    The fundamental of a sine of amplitude a clipped at c is a(2/π)(asin s + s√(1 − s²)),
     s = c/a. The stretch is d ln(true) / d ln(recorded).
     """
     s = np.concatenate([np.linspace(1.0, 0.05, 400), np.geomspace(0.05, 0.004, 60)[1:]])
@@ -207,22 +206,22 @@ def unclipped(
 
 
 def _unsettled(
-    seen: CheckedStates, states: TestStates, base: FittedHypothesis
+    checked: CheckedStates, states: TestStates, base: FittedHypothesis
 ) -> Iterator[TestCorrection]:
-    """What is left of the state before: of the mode's motion, or in the analyser's average.
+    """Remainder of the previous state: of the mode's motion, or in the analyser's average.
 
-    In a frame that turns with the force, V_n = V + (V_{n−1} − V) r after a dwell T: of a motion,
-    which decays and turns at the mode's own pace, r = e^{(−δ/2 + i(ω̃ − Ω))T}; of an average with
-    a time constant, as a lock-in amplifier has, r is the same real number at every state.
+    In the rotating frame of the force, V_n = V + (V_{n−1} − V) r after a dwell T. For the mode's
+    free decay r = e^{(−δ/2 + i(ω̃ − Ω))T}; for an average with a time constant, as in a lock-in
+    amplifier, r is the same real number at every state.
     """
     damping = np.abs(base.damping)
     omega = np.sqrt(np.maximum(base.stiffness, 0.25 * states.frequency**2))
     typical = float(np.median(damping)) / 2
     before = np.full(len(states.level), -1)
-    for of_level in states_of_levels(states.level, seen.order):
+    for of_level in states_of_levels(states.level, checked.order):
         before[of_level[1:]] = of_level[:-1]
-    pace = (-damping / 2 + 1j * (omega - states.frequency)) / typical if typical > 0 else 0.0
-    for decay in (pace, -1.0):
+    rate = (-damping / 2 + 1j * (omega - states.frequency)) / typical if typical > 0 else 0.0
+    for decay in (rate, -1.0):
         tried = []
         for fraction in _LEFT:
             left = np.where(before < 0, 0.0, np.exp(-np.log(fraction) * decay))
@@ -230,22 +229,22 @@ def _unsettled(
             stretch = np.abs(states.velocity / (true * (1 - left)))
             errors = states.errors.copy()
             errors[:, 1:3] *= stretch[:, None]
-            moved = states._replace(velocity=true, errors=errors)
-            tried.append(Tried(fraction, moved, 2 * float(np.sum(np.log(stretch)))))
-        value, judged = likeliest(base, tried)
-        yield TestCorrection("unsettled_steps", judged, value)
+            corrected = states._replace(velocity=true, errors=errors)
+            tried.append(Tried(fraction, corrected, 2 * float(np.sum(np.log(stretch)))))
+        value, fit = likeliest(base, tried)
+        yield TestCorrection("unsettled_steps", fit, value)
 
 
 def _noisy_force(states: TestStates, base: FittedHypothesis) -> Iterator[TestCorrection]:
-    """A force that falls at resonance into its cell's noise, which is of one size in newtons."""
+    """A force that drops at resonance into the noise of its cell, constant in newtons."""
     if deepest_fall(states) < FORCE_FALLS:
         return
     tried = []
     least = float(states.force.min())
-    for ratio in (4.0, 12.0, 40.0):  # the cell's noise over that of all else, at the least force
+    for ratio in (4.0, 12.0, 40.0):  # noise of the cell over all other noise, at the smallest force
         floor = ratio * least / states.force
         errors = states.errors.copy()
         errors[:, [0, 2]] = np.hypot(errors[:, [0, 2]], floor[:, None])
         tried.append(Tried(ratio, states._replace(errors=errors)))
-    ratio, judged = likeliest(base, tried)
-    yield TestCorrection("force_dropout", judged, ratio * least * judged.noise)
+    ratio, fit = likeliest(base, tried)
+    yield TestCorrection("force_dropout", fit, ratio * least * fit.noise)

@@ -1,4 +1,4 @@
-"""What the doctor finds: kinds, severities, and what an import does about them."""
+"""Findings of the doctor: kinds, severities, and corrections by an import."""
 
 from collections.abc import Sequence
 from typing import ClassVar, Literal, NamedTuple, get_args
@@ -31,17 +31,17 @@ Kind = Literal[
 ]
 
 KINDS: tuple[str, ...] = get_args(Kind)
-"""Everything that a finding may be called."""
+"""All kinds of findings."""
 
 FORCE_HARMONICS: Kind = "force_harmonics"
-"""Of the force that was measured; an effect of the model has this name, too."""
+"""Harmonics of the measured force; an effect of the model has the same name."""
 
 SEVERITIES: dict[str, Severity] = {
     **dict.fromkeys(KINDS, "error"),
     **dict.fromkeys((FORCE_HARMONICS, "force_dropout", "drift", "missing_anti_alias"), "warning"),
 }
-"""How grave each kind is: an "error" makes results wrong, a "warning" widens or bends them, an
-"info" is to be known."""
+"""Severity of each kind: an "error" makes results wrong, a "warning" widens or biases them, an
+"info" is for information."""
 
 _MEANINGS = {
     "kind": "what is wrong",
@@ -53,31 +53,31 @@ _MEANINGS = {
 
 
 class ImportCorrection(NamedTuple):
-    """How a table is read again, relative to how it was read: what options of an import say."""
+    """Corrections of an import, relative to the present table, as options of an import."""
 
     response: float = 1.0  # factor of the velocities
     force: float = 1.0  # likewise
-    unit: str = ""  # of the responses, where a number of that unit was taken for one of another
+    unit: str = ""  # true unit of the responses, where it was mistaken
     force_unit: str = ""  # likewise; V makes the force a drive voltage
-    quantity: str = ""  # "acceleration" or "displacement" that was taken for a velocity
+    quantity: str = ""  # "acceleration" or "displacement" imported as a velocity
     conjugate: bool = False
     phase_unit: str = ""  # "deg" or "rad"
 
 
 class Finding(NamedTuple):
-    """One thing that is wrong with a test, or may be.
+    """One definite or possible error of a test.
 
-    `rows` are states of the table (from 0) that show it, none where a record does.
+    `rows` are the affected states of the table (from 0), none for a record.
     """
 
     kind: Kind
     where: str  # file, level, rows or channel
     evidence: Fact | str
-    advice: Fact | str  # the line or option that mends it
+    advice: Fact | str  # the line or option that corrects it
     rows: tuple[int, ...] = ()
-    corrections: tuple[ImportCorrection, ...] = ()  # that an import can do, the likeliest first
-    title: Fact | None = None  # where the kind is wider than what was found
-    unsure: bool = False  # something else explains it as well: a warning then
+    corrections: tuple[ImportCorrection, ...] = ()  # possible at import, the most likely first
+    title: Fact | None = None  # where the kind is more general than the finding
+    unsure: bool = False  # another explanation exists: a warning then
 
     @property
     def severity(self) -> Severity:
@@ -86,19 +86,19 @@ class Finding(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What a reader is told first."""
+        """Title in a report."""
         return str(self.title or self.kind.replace("_", " "))
 
     def as_dict(self) -> dict[str, str]:
-        """What `check.json` has of it."""
+        """Entry in `check.json`."""
         columns = (self.kind, self.severity, self.where, str(self.evidence), str(self.advice))
         return dict(zip(_MEANINGS, columns, strict=True))
 
 
 class Checkup(AbstractResult):
-    """The findings of `check_test`, the gravest first; none where all is well.
+    """The findings of `check_test`, the most severe first; none where all is well.
 
-    `notes` say what could not be looked at, and why.
+    `notes` state what could not be checked, and why.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("finding",)
@@ -116,11 +116,11 @@ class Checkup(AbstractResult):
         )
 
     def variables(self) -> dict[str, Variable]:
-        """See `AbstractResult`; a row a finding."""
-        at, said = ("finding",), [finding.as_dict() for finding in self.findings]
-        number = Variable(at, np.arange(len(said)), "1", "number")
+        """See `AbstractResult`; one row per finding."""
+        at, rows = ("finding",), [finding.as_dict() for finding in self.findings]
+        number = Variable(at, np.arange(len(rows)), "1", "number")
         return {"finding": number} | {
-            name: Variable(at, np.array([one[name] for one in said], dtype=str), "", meaning)
+            name: Variable(at, np.array([one[name] for one in rows], dtype=str), "", meaning)
             for name, meaning in _MEANINGS.items()
         }
 
@@ -131,7 +131,7 @@ class Checkup(AbstractResult):
 
 
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Findings by severity, otherwise in their order; one of each kind and place."""
+    """Findings by severity, otherwise in their order; one of each kind and location."""
     ranks = get_args(Severity)
     once: dict[tuple[str, str], Finding] = {}
     for one in findings:

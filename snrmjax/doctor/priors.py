@@ -1,100 +1,99 @@
-"""What the check takes for likely, and what it takes to say otherwise: every number that decides.
+"""Priors and thresholds of the check: every number that decides.
 
-Relative sizes and natural logarithms where nothing else is said. Errors of states, levels and
-curves have their priors in `identify.test_model.priors`.
+Relative values and natural logarithms unless stated otherwise. Errors of states, levels and curves
+have their priors in `identify.test_model.priors`.
 """
 
 FITS_WELL = 0.06
-"""Relative error of a state, up to which a hypothesis fits in itself: single modes leave 1 to 5 %
-of measured beams, and twelve states pay for their curves with as much."""
+"""Relative error of a state up to which a hypothesis fits: single modes leave 1 to 5 % on measured
+beams, and with twelve states the curves cost as much."""
 
 SCATTER = 0.012
-"""Relative error of a state that needs no error of the test: analysers and levels leave it."""
+"""Relative error of a state without any error of the test, from analysers and levels."""
 
 NO_MODE = 0.3
-"""Misfit beyond which nothing that is small can have gone wrong, and phases are no mode's."""
+"""Misfit above which no small error explains the table, and phases are not those of a mode."""
 
 CLEARLY = 12.0
-"""ln of the odds, before priors, of what is said: some twenty hypotheses, true in one table of a
-hundred together, leave one wrong answer in a hundred from 20 · 10⁴ on."""
+"""ln of the Bayes factor required for a finding: with some twenty hypotheses, true in one table of
+a hundred together, a factor of 20 · 10⁴ leaves one wrong finding in a hundred."""
 
 MOST_OF_MISFIT = 0.5
-"""Of the mean square that states are missed by, which is left at most where what is wrong is named:
-if more of it has another cause, that may have this one's signs too, as a steep curve has a limit's.
-"""
+"""Largest fraction of the mean square misfit that may remain after a reported correction: a larger
+remaining cause may also explain this one, as a steep curve resembles clipping."""
 
 FEWEST_STATES = 8
-"""Of a table that is looked at: fewer say nothing of curves of their own."""
+"""Of a checked table: fewer do not determine curves."""
 
 MODAL_MASS = 0.05
-"""1σ of the modal mass over a linear test's: shapes and calibrations are good to some per cent.
+"""1σ of the modal mass of a linear test: shapes and calibrations are accurate to some per cent.
 
-States tell a modal mass where they do so better; within it a factor is √2 or a unit's."""
+Also the tolerance for recognising √2 or the factor of a unit."""
 
 ANY_MASS = 1.0
-"""1σ of a modal mass of which nothing is known, over where the states have it."""
+"""1σ of ln of an unknown modal mass, about the value of the states."""
 
 MOVES = 0.1
-"""1σ of what a stiffness changes along a test or from a structure to another: 5 % of frequency, as
-joints run in, masses are added or a room warms up."""
+"""1σ of stiffness changes along a test or between structures: 5 % of frequency, as joints run in,
+masses are added or a room warms up."""
 
 OTHER_GAIN = 0.4
-"""1σ of the force's gain of a level on another range, or in volts."""
+"""1σ of the force gain of a level measured on another range, or in volts."""
 
 OTHER_RANGE = 2.4
-"""|ln| of a gain, beyond a range's factor of ten, that two levels do not have where one mode fits
-them as recorded: such gains flatten steep damping, as of dry friction."""
+"""|ln| of a gain above a factor of ten, rejected for two levels where one mode fits as recorded:
+such gains flatten steep damping, as of dry friction."""
 
 OTHER_SCALE = 0.125
-"""|ln κ| from which on a modal mass is no linear test's: 2.5 times its 5 %."""
+"""|ln κ| above which a modal mass contradicts the linear test: 2.5 times its 5 %."""
 
 MOVED_MATTERS = 0.25
-"""Change of a natural frequency over its bandwidth, from which on it bends curves."""
+"""Change of a natural frequency over its bandwidth above which it distorts curves."""
 
 GAIN_MATTERS = 0.1
-"""Change of a gain between levels or along a test, beyond instruments' few per cent."""
+"""Change of a gain between levels or along a test, above the few per cent of instruments."""
 
 FORCE_FALLS = 0.5
-"""Share of a level's force that is missing at resonance, or of a response's: half is lost."""
+"""Fraction of a level's force or response that is missing at resonance: half is lost."""
 
-HELD = 0.05
+CONTROLLED = 0.05
 """Spread of ln |V| within a level whose response is controlled."""
 
 TOGETHER = 0.6
-"""Correlation of the logarithms of force, mobility and response where one makes the other."""
+"""Correlation of the logarithms of force, mobility and response if one causes the other."""
 
 FAR_FREQUENCY, FAR_DAMPING = 0.05, 3.0
-"""Of the lowest level from the linear mode, relative and as a ratio: beyond any drift."""
+"""Deviation of the lowest level from the linear mode, relative and as a ratio: above any drift."""
 
 BAND = 1.96
-"""1σ of a 95 % band."""
+"""Half-width of a 95 % band in 1σ."""
 
 MORE_DAMPING = 0.3
-"""Relative, over the linear test's at all amplitudes: mounting alone changes some 10 %."""
+"""Relative excess over the linear test at all amplitudes: mounting alone changes some 10 %."""
 
 FORCE_HARMONIC = 0.04
 """Of the force's fundamental: amplifiers and good controllers stay below 2 %."""
 
 CERTAIN = 6.0
-"""1σ of what is told by many neighbouring states, lines or steps."""
+"""Number of 1σ required from many neighbouring states, lines or steps."""
 
 STILL_MOVING = 0.03
-"""Change of the response over the force at the end of a step: damping is off as much."""
+"""Change of the response over the force at the end of a step: damping is off by as much."""
 
 FEWEST_CYCLES = 3.5
-"""Of a step that is looked at: fewer have no phasor and a transient besides."""
+"""Of a checked step: fewer do not give a phasor and a transient."""
 
 FEW_BLOCKS = 4
-"""Of a step, which have no scatter of their own to compare a change with."""
+"""Blocks of a step, up to which their scatter cannot be estimated."""
 
 STEPS_MOVE = 0.3
-"""Share of steps that must: a jump or a slow beat may move single ones."""
+"""Fraction of steps that must move: a jump or a slow beat may affect single ones."""
 
 FLAT_TOP = 0.26
-"""Share of a mean cycle within 3 % of its extremes; a sine has 0.156."""
+"""Fraction of a mean cycle within 3 % of its extremes; a sine has 0.156."""
 
 PILED_UP = 0.003
-"""Share of samples in runs of three at exactly the extreme of their channel."""
+"""Fraction of samples in runs of three at exactly the extreme of their channel."""
 
 FOLDED_LINE = 2e-3
-"""Of the fundamental: a line between harmonics from which on it is one of the drive's."""
+"""Of the fundamental: smallest line between harmonics that counts as an alias of the drive."""

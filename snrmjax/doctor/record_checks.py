@@ -1,4 +1,4 @@
-"""Time records: limits, transients, harmonics and drop-outs of the force, folded frequencies."""
+"""Time records: clipping, transients, harmonics and drop-outs of the force, aliases."""
 
 import itertools
 
@@ -28,7 +28,7 @@ _HIGHEST = 12  # harmonic of the force
 
 
 def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[Fact]]:
-    """Findings of one record, and what could not be looked at."""
+    """Findings of one record, and notes on what could not be checked."""
     name, rate = recording.name or "record", recording.sampling_rate
     forces = [c.name for c in recording.channels if c.quantity in ("force", "voltage")]
     motions = [
@@ -50,8 +50,8 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[Fact]
         track = track_tone(recording, force)
         steps = recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
     except ValueError as error:
-        unheard = Fact("record_without_tone", record=name, error=str(error))
-        return [*clipped.values()], [*notes, unheard]
+        no_tone = Fact("record_without_tone", record=name, error=str(error))
+        return [*clipped.values()], [*notes, no_tone]
     steps = [
         one
         for one in _joined(steps, rate)
@@ -62,15 +62,15 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[Fact]
     for c in values.keys() - clipped.keys():
         if flat := _flat_cycles(values[c], steps, rate, where[c]):
             clipped[c] = flat
-    found = [clipped[c] for c in values if c in clipped]
-    found += _harmonics(values[force], steps, rate, where[force])
+    findings = [clipped[c] for c in values if c in clipped]
+    findings += _harmonics(values[force], steps, rate, where[force])
     for c in motions:
-        found += _unsettled(values[force], values[c], steps, rate, where[c])
-        found += _dropped(values[force], values[c], steps, where[c])
+        findings += _unsettled(values[force], values[c], steps, rate, where[c])
+        findings += _dropped(values[force], values[c], steps, where[c])
     for c in (force, *motions):
         if c not in clipped:
-            found += _folded(values[c], steps, rate, where[c])
-    return found, notes
+            findings += _folded(values[c], steps, rate, where[c])
+    return findings, notes
 
 
 def _cycles(step: Step, rate: float) -> float:
@@ -78,7 +78,7 @@ def _cycles(step: Step, rate: float) -> float:
 
 
 def _joined(steps: list[Step], rate: float) -> list[Step]:
-    """Steps in which a transient of the force made a cut, whole again."""
+    """Steps, with those rejoined that a transient of the force has split."""
     whole: list[Step] = []
     for one in steps:
         if whole:
@@ -95,17 +95,17 @@ def _joined(steps: list[Step], rate: float) -> list[Step]:
 
 
 def _flat_runs(x: Float[np.ndarray, " sample"], where: str) -> Finding | None:
-    """Neighbouring samples that all stand at the channel's extreme."""
+    """Neighbouring samples at exactly the extreme of the channel."""
     top, bottom = float(x.max()), float(x.min())
-    size = max(abs(top), abs(bottom))
-    if size == 0:
+    largest = max(abs(top), abs(bottom))
+    if largest == 0:
         return None
     fraction, piled = 0.0, 0
     for limit, sign in ((top, 1.0), (bottom, -1.0)):
-        at = sign * (limit - x) <= 1e-6 * size
+        at = sign * (limit - x) <= 1e-6 * largest
         three = at[2:] & at[1:-1] & at[:-2]
         fraction += float(three.mean()) if len(three) else 0.0
-        piled += _piled_up(sign * x, at, 2e-6 * size)
+        piled += _piled_up(sign * x, at, 2e-6 * largest)
     if fraction < PILED_UP and not piled:
         return None
     crowd = piled if fraction < PILED_UP else None
@@ -115,11 +115,11 @@ def _flat_runs(x: Float[np.ndarray, " sample"], where: str) -> Finding | None:
 
 
 def _piled_up(x: Float[np.ndarray, " sample"], at: np.ndarray, width: float) -> int:
-    """Samples at the top of a channel (`at`) where they crowd as no sine's do; else zero.
+    """Number of samples at the top of a channel (`at`) if more than for a sine; else zero.
 
-    A digitised sine crowds in its last count, √n − √(n − 1) of it in the n-th below, at most 2.4
-    times as much as in the next; one that is sampled in step with its cycles, or has no noise,
-    comes back to every value as often. Neighbours at the top are no single peak of many cycles.
+    For a digitised sine the n-th count below the top holds √n − √(n − 1) of the samples of the top
+    one, so that the top has at most 2.4 times as many as the next; a sine sampled synchronously or
+    without noise has every value equally often. Neighbours at the top are no single peaks.
     """
     number = int(at.sum())
     upper = x[(x > 0.5 * x.max()) & ~at]
@@ -134,27 +134,27 @@ def _clipping(where: str, evidence: Fact) -> Finding:
 
 
 def _middle(step: Step, fraction: float = 0.5) -> slice:
-    """The last part of a step, without its very end."""
+    """The last part of a step, without its end."""
     length = step.stop - step.start
     return slice(int(step.stop - fraction * length), int(step.stop - 0.02 * length))
 
 
 def _demodulated(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndarray:
-    """Phasors of neighbouring cycles against the record's own clock."""
+    """Phasors of neighbouring blocks of cycles, with phases relative to the record's time axis."""
     cycle, n = 2 * np.pi * rate / frequency, rows.stop - rows.start
     blocks = max(1, min(int(n / cycle), 32))
     edges = np.round(np.arange(blocks + 1) * int(n / cycle / blocks) * cycle).astype(int)
     part = x[rows.start : rows.start + edges[-1]]
-    turn = np.exp(-1j * frequency * (rows.start + np.arange(len(part))) / rate)
+    rotation = np.exp(-1j * frequency * (rows.start + np.arange(len(part))) / rate)
     ends = itertools.pairwise(edges)
-    return np.array([2 * np.mean((part[a:b] - part[a:b].mean()) * turn[a:b]) for a, b in ends])
+    return np.array([2 * np.mean((part[a:b] - part[a:b].mean()) * rotation[a:b]) for a, b in ends])
 
 
 def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> Finding | None:
-    """A mean cycle whose tops are flat, where noise hides the single samples' limit."""
-    sizes = [float(np.std(x[_middle(step)])) for step in steps]
+    """A mean cycle with flat tops, for clipping hidden by noise in single samples."""
+    levels = [float(np.std(x[_middle(step)])) for step in steps]
     best = None
-    for k in np.argsort(sizes)[-3:]:
+    for k in np.argsort(levels)[-3:]:
         one = steps[int(k)]
         rows = _middle(one)
         phase = (one.frequency * np.arange(rows.start, rows.stop) / rate) % (2 * np.pi)
@@ -189,18 +189,18 @@ def _lines(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndar
     time = np.arange(rows.start, rows.stop) / rate
     most = min(_HIGHEST, int(0.95 * np.pi * rate / frequency))
     if most < 2 or len(time) < 4 * most + 4:
-        return np.append(1.0, np.zeros(_HIGHEST - 1))  # too short to tell harmonics apart
-    turns = np.outer(time, frequency * np.arange(1, most + 1))
-    design = np.concatenate([np.ones((len(time), 1)), np.cos(turns), np.sin(turns)], axis=1)
+        return np.append(1.0, np.zeros(_HIGHEST - 1))  # too short to separate harmonics
+    phases = np.outer(time, frequency * np.arange(1, most + 1))
+    design = np.concatenate([np.ones((len(time), 1)), np.cos(phases), np.sin(phases)], axis=1)
     theta = np.linalg.lstsq(design, x[rows], rcond=None)[0]
-    size = np.hypot(theta[1 : 1 + most], theta[1 + most :])
-    return np.concatenate([size, np.zeros(_HIGHEST - most)])
+    amplitude = np.hypot(theta[1 : 1 + most], theta[1 + most :])
+    return np.concatenate([amplitude, np.zeros(_HIGHEST - most)])
 
 
 def _unsettled(
     force: np.ndarray, x: np.ndarray, steps: list[Step], rate: float, where: str
 ) -> list[Finding]:
-    """Steps whose response still moves at their end, more than its blocks scatter."""
+    """Steps whose response still changes at their end by more than the scatter of its blocks."""
     moving, over_noise = [], []
     for one in steps:
         rows = _middle(one, min(1.0, max(0.3, 5 / _cycles(one, rate))))
@@ -208,27 +208,27 @@ def _unsettled(
         if len(v) < 3 or not np.all(np.abs(f) > 0):
             continue
         z = v / f
-        place = np.linspace(-0.5, 0.5, len(z))
-        slope = np.sum(place * (z - z.mean())) / np.sum(place**2)
-        rest = z - z.mean() - slope * place
-        # A transient bends, too: only what jumps from block to block is noise.
+        position = np.linspace(-0.5, 0.5, len(z))
+        slope = np.sum(position * (z - z.mean())) / np.sum(position**2)
+        rest = z - z.mean() - slope * position
+        # A transient is curved: noise is estimated from second differences (variance 6σ²).
         jumps = np.diff(rest, 2) if len(rest) > 4 else rest
-        noise = float(np.sqrt(np.mean(np.abs(jumps) ** 2) / 6 / np.sum(place**2)))
+        noise = float(np.sqrt(np.mean(np.abs(jumps) ** 2) / 6 / np.sum(position**2)))
         change = float(abs(slope) / abs(z[-1]))
         few = len(v) <= FEW_BLOCKS
-        # Without a scatter of its own a step must move by more.
+        # Without an estimate of its scatter a step must change by more.
         believed = change > 2.5 * STILL_MOVING if few else abs(slope) > CERTAIN * noise
         if change > STILL_MOVING:
             moving.append((change, one, believed))
         if not few:
             over_noise.append(abs(slope) / max(noise, 1e-300))
-    # Among five blocks a transient's own turning passes for scatter, but not in step after step.
+    # In five blocks the rotation of a transient resembles scatter, but not in many steps.
     together = len(over_noise) >= CERTAIN and np.median(over_noise) > CERTAIN / 3
     if not (together and 2 * len(moving) > len(steps)):
         moving = [one for one in moving if one[2]]
     if len(moving) < max(1, STEPS_MOVE * len(steps)):
         return []
-    worst, one, _ = max(moving, key=lambda found: found[0])
+    worst, one, _ = max(moving, key=lambda step: step[0])
     evidence = Fact(
         "steps_move",
         n_moving=len(moving),
@@ -240,17 +240,17 @@ def _unsettled(
 
 
 def _dropped(force: np.ndarray, x: np.ndarray, steps: list[Step], where: str) -> list[Finding]:
-    """Force that falls where the response over it is strongest, and comes back beside it.
+    """Force that drops where the mobility is largest and recovers on both sides.
 
-    Where it does not come back another level begins, whose force is another.
+    Without recovery it is the start of another level.
     """
     if len(steps) < 5:
         return []
     f, v = (np.array([np.std(c[_middle(step)]) for step in steps]) * 2**0.5 for c in (force, x))
     drop, nominal = fall(f, v / f)
     least = int(np.argmin(f))
-    beside = min(f[:least].max(initial=0.0), f[least + 1 :].max(initial=0.0))
-    back = beside > nominal * (1 - 0.5 * drop)
+    around = min(f[:least].max(initial=0.0), f[least + 1 :].max(initial=0.0))
+    back = around > nominal * (1 - 0.5 * drop)
     if drop < FORCE_FALLS or not back or np.ptp(np.log(v)) < 0.25:
         return []
     evidence = Fact("record_force_falls", force=nominal, fall=drop)
@@ -258,7 +258,7 @@ def _dropped(force: np.ndarray, x: np.ndarray, steps: list[Step], where: str) ->
 
 
 def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:
-    """Lines that are no harmonics of the drive below half the rate, and what they are images of."""
+    """Lines between the harmonics of the drive, and the harmonics of which they are aliases."""
     images: list[tuple[float, float, int]] = []
     others: list[tuple[float, float]] = []
     for one in sorted(steps, key=lambda one: one.start - one.stop)[:12]:
@@ -276,11 +276,11 @@ def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[F
         away = np.abs(hertz - f0 * np.round(hertz / f0)) > guard
         width = max(16, len(spectrum) // 64)
         for k in np.flatnonzero(away[1:-1]) + 1:
-            size = float(spectrum[k])
-            if size < FOLDED_LINE * fundamental or size < max(spectrum[k - 1], spectrum[k + 1]):
+            line = float(spectrum[k])
+            if line < FOLDED_LINE * fundamental or line < max(spectrum[k - 1], spectrum[k + 1]):
                 continue
             around = spectrum[max(0, k - width) : k + width][away[max(0, k - width) : k + width]]
-            if size < 2 * CERTAIN * float(np.median(around)):
+            if line < 2 * CERTAIN * float(np.median(around)):
                 continue
             f = float(hertz[k])
             if any(abs(f - m * round(f / m)) < 1.0 and f < 8.5 * m for m in (50.0, 60.0)):
@@ -289,11 +289,11 @@ def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[F
             alias = np.abs(orders * f0 - rate * np.round(orders * f0 / rate))
             off = np.abs(alias - f)
             if len(orders) and off.min() < 1.5 * rate / n + 1e-4 * f0 * orders[off.argmin()]:
-                images.append((size / fundamental, f, int(orders[off.argmin()])))
+                images.append((line / fundamental, f, int(orders[off.argmin()])))
             else:
-                others.append((size / fundamental, f))
+                others.append((line / fundamental, f))
     if not (images or others):
         return []
-    size, line, order = max(images) if images else (*max(others), None)
-    evidence = Fact("line_folded", frequency_hz=line, ratio=size, rate_hz=rate, order=order)
+    ratio, line, order = max(images) if images else (*max(others), None)
+    evidence = Fact("line_folded", frequency_hz=line, ratio=ratio, rate_hz=rate, order=order)
     return [Finding("missing_anti_alias", where, evidence, Fact("advice_folded"))]

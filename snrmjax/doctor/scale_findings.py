@@ -1,4 +1,4 @@
-"""The modal mass that a table asks for over the model's: rms, units, volts, another shape."""
+"""Causes of a modal mass other than the model's: rms values, units, volts, another shape."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -17,72 +17,83 @@ _VOLTS = (ImportCorrection(force_unit="V"),)
 
 
 def is_other_scale(scale: Scale, as_modelled: FittedHypothesis) -> bool:
-    """Whether states tell a modal mass that is no linear test's, better than the model's own."""
+    """Whether the states determine a modal mass that contradicts the linear test."""
     controlled = as_modelled.posterior.phase_is_controlled
     if controlled or abs(np.log(scale.mass)) < OTHER_SCALE + BAND * scale.std:
         return False
     jacobian = as_modelled.evidence - as_modelled.posterior.log_evidence
-    held = fit_hypothesis(as_modelled.states._replace(mass_std=0.0), jacobian)
-    # What a mode leaves off resonance is some per cent of its damping: no other modal mass.
-    return scale.judged.beats(held, beside=False)
+    modelled = fit_hypothesis(as_modelled.states._replace(mass_std=0.0), jacobian)
+    # The misfit of one mode off resonance is some per cent of its damping, no other modal mass.
+    return scale.fit.beats(modelled, discrepancy=False)
 
 
 def scale_findings(
     scale: Scale, as_modelled: FittedHypothesis, model: Structure, where: str
 ) -> list[Finding]:
-    """What makes the modal mass another one.
+    """Possible causes of another modal mass.
 
-    κ is V_recorded/F_recorded upside down against the truth: an rms force makes it 1/√2, an rms
-    response √2. Other factors are two units', a force in volts or a shape of another scale.
+    κ is recorded over true F/V: an rms force makes it 1/√2, an rms response √2. Other factors are
+    mixed units, a force in volts or a shape of another scale.
     """
     kappa = scale.mass
     asked = {"ratio": kappa, "ratio_std": kappa * scale.std}
-    size = Fact(
-        "other_scale", **asked, misfit=scale.judged.misfit, misfit_as_modelled=as_modelled.misfit
+    evidence_of_scale = Fact(
+        "other_scale", **asked, misfit=scale.fit.misfit, misfit_as_modelled=as_modelled.misfit
     )
     off, near = float(np.log(kappa)), float(np.hypot(MODAL_MASS, 3 * scale.std))
     if abs(abs(off) - 0.5 * np.log(2)) < near:
         column = "response" if off > 0 else "force"
-        evidence, advice = Fact("rms", scale=size, column=column), Fact("advice_rms", column=column)
+        evidence, advice = (
+            Fact("rms", scale=evidence_of_scale, column=column),
+            Fact("advice_rms", column=column),
+        )
         correction = (
             ImportCorrection(response=2**0.5) if off > 0 else ImportCorrection(force=2**0.5)
         )
         return [Finding("rms_for_peak", where, evidence, advice, corrections=(correction,))]
-    bend = _bend(scale.judged.states, scale.judged.stiffness, model)
-    agrees = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
+    stiffening = _stiffening_ratio(scale.fit.states, scale.fit.stiffness, model)
+    agrees = stiffening is not None and abs(np.log(stiffening)) < OTHER_SCALE * 3
     units = [unit for unit in _mixed_units() if abs(off - np.log(unit.mass)) < near]
     units = [unit for unit in units if not (agrees and unit.column == "response")]
-    found, unsure = [], bool(units)
+    findings, unsure = [], bool(units)
     if units:
-        size = Fact("if_units_are_right")
+        evidence_of_scale = Fact("if_units_are_right")
         names = tuple(unit[:3] for unit in units)
         evidence = Fact("mixed_units", **asked, factor=units[0].mass, units=names)
         corrections = tuple(unit.correction for unit in units)
         advice = Fact("advice_units", units=names)
-        found.append(Finding("wrong_unit", where, evidence, advice, corrections=corrections))
-    of_force, of_shape = _signs(scale.judged, model, bend, agrees=agrees)
+        findings.append(Finding("wrong_unit", where, evidence, advice, corrections=corrections))
+    of_force, of_shape = _signs(scale.fit, model, stiffening, agrees=agrees)
     if of_force >= of_shape:
-        evidence, advice = Fact("voltage_for_force", scale=size, gain=kappa), Fact("advice_voltage")
-        found.append(
+        evidence, advice = (
+            Fact("voltage_for_force", scale=evidence_of_scale, gain=kappa),
+            Fact("advice_voltage"),
+        )
+        findings.append(
             Finding("volts_as_force", where, evidence, advice, corrections=_VOLTS, unsure=unsure)
         )
     if of_shape >= of_force:
-        evidence, advice = Fact("shape_scale", scale=size), Fact("advice_shape", factor=kappa**0.5)
-        found.append(Finding("shape_not_mass_normalised", where, evidence, advice, unsure=unsure))
-    return found
+        evidence, advice = (
+            Fact("shape_scale", scale=evidence_of_scale),
+            Fact("advice_shape", factor=kappa**0.5),
+        )
+        findings.append(
+            Finding("shape_not_mass_normalised", where, evidence, advice, unsure=unsure)
+        )
+    return findings
 
 
 class _MixedUnit(NamedTuple):
-    """Numbers of one unit that were read as another's, and what the modal mass then becomes."""
+    """Values of one unit read as another, and the resulting modal mass."""
 
     column: str  # "response" or "force"
-    unit: str  # of the numbers
+    unit: str  # of the values
     taken_for: str
     mass: float  # over the model's
 
     @property
     def correction(self) -> ImportCorrection:
-        """Reading with the right unit."""
+        """The import with the right unit."""
         written = {"m/s²": "m/s2", "µm": "um", "inches": "in", "pounds": "lbf"}
         unit = written.get(self.unit, self.unit)
         if self.column == "force":
@@ -91,9 +102,9 @@ class _MixedUnit(NamedTuple):
 
 
 def _mixed_units() -> Iterator[_MixedUnit]:
-    """κ is force over response: upside down for a force, and where both units change places.
+    """κ for pairs of units; it is inverted for a force and where both units are exchanged.
 
-    The likely one first: a number of the small unit read as one of the large, then the reverse.
+    The more likely first: values in the small unit read as the large one, then the reverse.
     """
     pairs = (
         *(("response", "g", "m/s²", 9.80665), ("response", "mm", "m", 1e-3)),
@@ -106,20 +117,20 @@ def _mixed_units() -> Iterator[_MixedUnit]:
 
 
 def _signs(
-    fit: FittedHypothesis, model: Structure, bend: float | None, *, agrees: bool
+    fit: FittedHypothesis, model: Structure, stiffening: float | None, *, agrees: bool
 ) -> tuple[int, int]:
-    """What else speaks for a force that is none, and for a shape of another scale."""
+    """Further signs of a voltage as force, and of a shape of another scale."""
     modes = model.modes
     j = modes.mode_of_interest
     column = np.abs(np.asarray(modes.mode_shape)[:, j])
     plain = abs(column.max() - 1) < 1e-6 or abs(np.linalg.norm(column) - 1) < 1e-6
     rate = 2 * float(np.prod(linear_mode(modes)))
     damped = rate > 0 and float(np.min(fit.damping)) > (1 + MORE_DAMPING) * rate
-    return int(agrees) + int(damped), int(plain) + int(bend is not None and not agrees)
+    return int(agrees) + int(damped), int(plain) + int(stiffening is not None and not agrees)
 
 
-def _bend(states: TestStates, stiffness: np.ndarray, model: Structure) -> float | None:
-    """The measured growth of stiffness over that of the model's potential; None if both are small.
+def _stiffening_ratio(states: TestStates, stiffness: np.ndarray, model: Structure) -> float | None:
+    """Measured stiffening over that of the model's potential; None if either is too small.
 
     K(a) − ω² = (2/π) ∫ f(a cos β) cos β dβ / a of the potential's own force, a = |V|/(Ω Φ).
     """
@@ -146,11 +157,10 @@ def _bend(states: TestStates, stiffness: np.ndarray, model: Structure) -> float 
 
 
 def shaker_damping(fit: FittedHypothesis, model: Structure, where: str) -> list[Finding]:
-    """Damping above the linear test's by one amount at all amplitudes, at its own frequency.
+    """Damping above the linear test's by a constant amount, at the same natural frequency.
 
-    That is what a shaker adds between its drive and the structure, (Bl)²/R of a coil on a voltage;
-    what structures add changes with amplitude. Nothing where the model states no error of its
-    damping.
+    A shaker adds (Bl)²/R of its coil if the drive voltage is taken as force; damping of structures
+    changes with amplitude. Nothing where the model states no error of its damping.
     """
     modes = model.modes
     one = modes.mode_of_interest

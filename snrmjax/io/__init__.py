@@ -1,6 +1,6 @@
-"""Files in and out: tables of steady states and of results, models, joint fits.
+"""Read and write files: steady states, results, models and joint fits.
 
-Readers are `read_X(path)`, writers `write_X(path, what)`; both take any path that Python takes.
+Readers are `read_X(path)`, writers `write_X(path, what)`; both accept any path-like object.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""The columns of a steady-state table: which is what, and what is wrong with a header."""
+"""The columns of a steady-state table, and the checks of its header."""
 
 import re
 from collections.abc import Iterable
@@ -10,26 +10,26 @@ from snrmjax.numerics.names import near_miss
 from snrmjax.numerics.rules import FRACTION, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, SHORT, WHOLE, Rule
 
 PHASOR = ("velocity_re_m_s", "velocity_im_m_s")
-"""Of the fundamental."""
+"""Real and imaginary part of the fundamental."""
 
 AMPLITUDE = "velocity_m_s"
-"""The amplitude of the fundamental: in place of both parts of the phasor, and only then."""
+"""The amplitude of the fundamental: used where both parts of the phasor are missing."""
 
 REQUIRED: dict[str, tuple[Rule, ...]] = {
     "level": (WHOLE, SHORT),
     "frequency_hz": (POSITIVE, IN_RANGE_HZ),
     **dict.fromkeys(PHASOR, ()),
 }
-"""Columns that every table has, beside `force_n` or `drive_v`, and the rules of their numbers."""
+"""Columns of every table, in addition to `force_n` or `drive_v`, with rules for their numbers."""
 
 FORCES: dict[str, tuple[Rule, ...]] = {"force_n": (POSITIVE,), "drive_v": (POSITIVE,)}
-"""Columns of which a table has exactly one, or both parts of a base's acceleration."""
+"""Exactly one of these columns is required, or both parts of a base acceleration."""
 
 BASE = ("base_acceleration_re_m_s2", "base_acceleration_im_m_s2")
-"""The acceleration of a base that moves, as a phasor, in place of a force."""
+"""Phasor of the base acceleration, in place of a force."""
 
 BASE_STD = "base_acceleration_std_m_s2"
-"""Its 1σ, in place of that of a force."""
+"""1σ of the base acceleration."""
 
 OPTIONAL: dict[str, tuple[Rule, ...]] = {
     "velocity_std_m_s": (NOT_NEGATIVE,),
@@ -38,15 +38,15 @@ OPTIONAL: dict[str, tuple[Rule, ...]] = {
     "order": (FRACTION,),
     "harmonic_std_m_s": (NOT_NEGATIVE,),
 }
-"""Columns of numbers that a table may have, and in which a field may be empty."""
+"""Optional columns of numbers; a field may be empty."""
 
 _KNOWN = frozenset(
     (*REQUIRED, *FORCES, *BASE, BASE_STD, *OPTIONAL, "sensor")
-)  # all but those of the harmonics
+)  # all except the harmonics
 _STEMS = {
     stem: name for name in _KNOWN if (stem := re.sub(r"_(hz|n|v|m_s|m_s2|deg)$", "", name)) != name
 }
-# What stands behind a stem when someone meant the column, but in another unit or in none.
+# Units that may follow a stem where the column is meant, but in another unit.
 _UNIT = re.compile(
     r"[kmg]?hz|(?:m?rad|deg(?:rees?)?)(?:_?s|_per_s)?|[rc]pm|[kmun]?n|newtons?|lbf?|kgf|[kmu]?v|"
     r"volts?|(?:[kcmun]?m|in|ft)(?:_s2?|_h|_per_s)?|ips|g|m?s|percent|pct|db|rel|rms(?:_m_s)?"
@@ -56,7 +56,7 @@ _LIKE_HARMONIC = re.compile(r"velocity_h([0-9]+)(.*)")
 
 
 class Header(NamedTuple):
-    """The columns that are used, the harmonics among them, and notes."""
+    """The columns used, the harmonic orders among them, and notes."""
 
     used: frozenset[str]
     harmonic_order: tuple[int, ...]
@@ -80,7 +80,7 @@ def harmonic_columns(order: int) -> tuple[str, ...]:
 
 
 def is_ours(names: Iterable[str]) -> bool:
-    """Whether columns are meant as ours: the reader of our tables then says what is amiss."""
+    """Whether the names are those of our format; its reader then reports any error."""
     return {"frequency_hz", "velocity_re_m_s"} <= {*names} or {
         *("frequency_hz", AMPLITUDE, "level")
     } <= {*names}
@@ -120,7 +120,7 @@ def _require(used: set[str], further: list[str], file: str, force_known: bool) -
     """Refuse a header that lacks a column or has both force and drive."""
 
     def instead(name: str) -> str:
-        """The column that may stand for a missing one."""
+        """The column that was perhaps meant by a missing one."""
         near = near_miss(name, further)
         return "" if near is None else f" (is it `{shortened_name(near)}`?)"
 
@@ -142,7 +142,7 @@ def _require(used: set[str], further: list[str], file: str, force_known: bool) -
 
 
 def _require_base(used: set[str], forces: set[str], file: str) -> None:
-    """Refuse half a base's acceleration, one beside a force, and an error of the other kind."""
+    """Refuse an incomplete base acceleration, base and force together, and a misplaced 1σ."""
     of_base = used.intersection(BASE)
     if len(of_base) == 1:
         missing = next(name for name in BASE if name not in used)
@@ -174,7 +174,7 @@ def _harmonic_orders(used: set[str], file: str) -> tuple[int, ...]:
 
 
 def _misnamed(name: str) -> str | None:
-    """The column that an unknown name must have meant, or nothing."""
+    """The column that an unknown name must mean, or None."""
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     if plain in _KNOWN:
         return plain

@@ -1,4 +1,4 @@
-"""`diagnosis.json`: what a diagnosis says, for other programs."""
+"""`diagnosis.json`: the results of a diagnosis for other programs."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.model.effect_metadata import Argument
 
-_ALIKE = 0.05  # of the best law's probability: those that the sensors cannot tell from it
+_ALIKE = 0.05  # laws above this fraction of the best law's probability count as indistinguishable
 
 
 def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse] = ()) -> dict:
@@ -23,14 +23,14 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
     `level`, states `off_resonance` at it, a `lower_level` or `higher_level` whose velocities are
     those of `level` scaled, or a `calibration`), the force and frequency at resonance, how many
     `states` and how far off resonance in phase, the `harmonics` with the noise that they need, the
-    `quantity` in which the models differ most, the expected gain of χ² over the rival that is
-    separated least well and the gain that is needed; `calibration_too` if effects stay open that
-    only a calibration separates. With the verdict `drawn` there is a `law`: see `DrawnLaw`; of a
+    `quantity` in which the models differ most, the expected gain of χ² over the
+    closest rival and the gain needed; `calibration_too` if only a calibration separates some of
+    the effects. With the verdict `drawn` there is a `law`: see `DrawnLaw`; of a
     damping that depends on the displacement `force_n` is the force at `at_velocity_m_s`, beyond
-    `measured_up_to` (m or m/s) it is extrapolated, and `further` laws that were needed beside it
-    have tables of their own. `probability` is that of the answer given: of its verdict, or of
-    the members of its classes; `probabilities` are those of all answers considered. `tried` has
-    every fit that was compared with its `status`.
+    `measured_up_to` (m or m/s) it is extrapolated, and `further` laws that are needed in addition
+    have their own tables. `probability` is that of the answer given (of its verdict, or of the
+    members of its classes), `probabilities` those of all answers considered. `tried` lists every
+    fit compared, with its `status`.
     """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
@@ -46,7 +46,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
         **({"law": laws[0]} if laws else {}),
         "decide_by": diagnosis.decide_by,
         "request": _test(diagnosis.discriminating_test),
-        "parts": [_by_part(one) for one in diagnosis.parts],
+        "parts": [_by_part(part) for part in diagnosis.parts],
         "located": [_part(part) for part in diagnosis.located],
         "parameters": {
             name: {"value": value, "std": std}
@@ -105,12 +105,12 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
 def _test(test: DiscriminatingTest | None) -> dict | None:
     if test is None:
         return None
-    place = test.place
+    operating_point = test.operating_point
     return {
         "kind": test.kind,
-        "level": place.level if place else None,
-        "force_n": place.force if place else None,
-        "frequency_hz": place.frequency if place else None,
+        "level": operating_point.level if operating_point else None,
+        "force_n": operating_point.force if operating_point else None,
+        "frequency_hz": operating_point.frequency if operating_point else None,
         "quantity": test.quantity,
         "states": test.states,
         "phase_deg": list(test.phase) if test.phase else None,
@@ -138,26 +138,28 @@ def _law(law: DrawnLaw) -> dict:
 def remainder_columns(parts: Sequence[PartAnswer]) -> dict[str, list]:
     """The remainders of all parts as columns of a table: relative, with their 1σ."""
     columns: dict[str, list] = {"part": [], "velocity_m_s": [], "value": [], "std": []}
-    for one in parts:
-        if one.remainder is not None:
-            left = one.remainder
-            columns["part"] += [one.part] * len(left.velocity)
-            columns["velocity_m_s"] += left.velocity.tolist()
-            columns["value"] += left.value.tolist()
-            columns["std"] += left.std.tolist()
+    for part in parts:
+        if part.remainder is not None:
+            remainder = part.remainder
+            columns["part"] += [part.part] * len(remainder.velocity)
+            columns["velocity_m_s"] += remainder.velocity.tolist()
+            columns["value"] += remainder.value.tolist()
+            columns["std"] += remainder.std.tolist()
     return columns
 
 
-def _by_part(one: PartAnswer) -> dict:
-    explained, left = one.explained, one.remainder
+def _by_part(part: PartAnswer) -> dict:
+    explained, remainder = part.explained, part.remainder
     return {
-        "part": one.part,
-        "verdict": one.verdict,
-        "effects": list(one.effects),
-        "candidates": [list(group) for group in one.candidates],
-        "probability": one.probability,
+        "part": part.part,
+        "verdict": part.verdict,
+        "effects": list(part.effects),
+        "candidates": [list(group) for group in part.candidates],
+        "probability": part.probability,
         "explained": None if explained is None else explained._asdict(),
-        "remainder": None if left is None else {"rms": left.rms, "significant": left.significant},
+        "remainder": None
+        if remainder is None
+        else {"rms": remainder.rms, "significant": remainder.significant},
     }
 
 
@@ -172,28 +174,30 @@ def _part(part: Located) -> dict:
     return entry
 
 
-def summarise_localisation(found: Localisation) -> dict:
-    """Where a force acts: places with their probabilities, and the law at the first."""
-    law = found.places[0].law
+def summarise_localisation(localisation: Localisation) -> dict:
+    """Where a force acts: locations with their probabilities, and the law at the most probable."""
+    law = localisation.places[0].law
     return {
-        "where": found.by_place,
-        "where_misfit": found.misfit,
-        "where_fits": found.fits,
+        "where": localisation.by_place,
+        "where_misfit": localisation.misfit,
+        "where_fits": localisation.fits,
         "where_law": None if law is None else {"kind": law.kind, "parameters": law.parameters},
-        "where_settled_by_sensor": None if found.told else found.settled_by,
+        "where_settled_by_sensor": None if localisation.told else localisation.settled_by,
     }
 
 
-def placed_answer(found: Localisation) -> dict:
-    """The answer of a diagnosis whose effects act on one mode only, where a placed law explains it.
+def placed_answer(localisation: Localisation) -> dict:
+    """The answer of a one-mode diagnosis that a law at an attachment point explains.
 
-    Parameters are physical (N, m, kg), as those of an effect with `at`.
+    Parameters are physical (N, m, kg), like those of an effect with `at`.
     """
-    first = found.places[0]
-    law = first.law
+    most_probable = localisation.places[0]
+    law = most_probable.law
     if law is None:
         return {}
-    fractions = {kind: first.probability * fraction for kind, fraction in first.laws.items()}
+    fractions = {
+        kind: most_probable.probability * fraction for kind, fraction in most_probable.laws.items()
+    }
     alike = [
         kind for kind, fraction in fractions.items() if fraction > _ALIKE * fractions[law.kind]
     ]
@@ -201,7 +205,7 @@ def placed_answer(found: Localisation) -> dict:
         "verdict": Verdict.NAMED.value if len(alike) == 1 else Verdict.AMBIGUOUS.value,
         "effects": [law.kind],
         "candidates": [sorted(alike, key=lambda kind: -fractions[kind])],
-        "probabilities": {**fractions, "elsewhere": 1 - first.probability},
+        "probabilities": {**fractions, "elsewhere": 1 - most_probable.probability},
         "probability": sum(fractions[kind] for kind in alike),
         "decide_by": None,
         "parameters": {

@@ -1,4 +1,4 @@
-"""Reading and writing whole files, and the words that messages about them share."""
+"""Reading and atomic writing of files, and how messages show names and values."""
 
 import json
 import math
@@ -30,9 +30,9 @@ def read_bytes(path: FilePath, most: int = -1) -> bytes:
 
 
 def read_text(path: FilePath) -> str:
-    """The text of a UTF-8 file, without a byte-order mark and with its line ends as they are.
+    """The text of a UTF-8 file, without a byte-order mark and with line ends unchanged.
 
-    Raises `ValueError` as `read_bytes` does, and for what is not text.
+    Raises `ValueError` as `read_bytes` does, and for a file that is not text.
     """
     content = read_bytes(path)
     if b"\0" in content:
@@ -47,7 +47,7 @@ def read_text(path: FilePath) -> str:
 
 @contextmanager
 def written_whole(path: FilePath) -> Iterator[Path]:
-    """A temporary file beside `path` to write into, which then takes its name, or nothing is left.
+    """A temporary file next to `path`, which replaces it on success and is removed on failure.
 
     Raises `ValueError` when the folder does not exist or cannot be written.
     """
@@ -65,7 +65,7 @@ def written_whole(path: FilePath) -> Iterator[Path]:
 
 
 def write_atomically(path: FilePath, content: str | bytes) -> None:
-    """Write a whole file or nothing; a text in UTF-8 with its line ends as they are.
+    """Write a file atomically; a text in UTF-8 with line ends unchanged.
 
     Raises `ValueError` as `written_whole` does.
     """

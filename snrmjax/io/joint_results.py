@@ -1,4 +1,4 @@
-"""A joint fit as tables, as part of a summary, and as a file that gives it back."""
+"""A joint fit as tables, as a summary, and as a file that can be read back."""
 
 import importlib
 import json
@@ -46,8 +46,7 @@ def write_next(
 ) -> None:
     """Write the advised measurements, the best first; `force_unit` as for `results.load_named`.
 
-    Where only the drive is known a column `drive_v` has it, and `force_n` is by the gain that the
-    fit found.
+    Where only the drive is known, a column `drive_v` has it, and `force_n` uses the fitted gain.
     """
     columns: dict[str, Sequence[object]] = {
         "rank": [measurement.rank for measurement in advice],
@@ -67,7 +66,7 @@ def write_next(
 def summarise_fit(
     fit: JointFit, responses: Sequence[FittedResponse], fractions: Sequence[Contribution] = ()
 ) -> dict:
-    """What a joint fit found, by name, in the units of the files."""
+    """Results of a joint fit by name, in the units of the files."""
     std, unit = np.sqrt(np.diag(fit.covariance)), fit.modes.force_unit
     vector = np.asarray(fit.vector()[0])
     linear = len(fit.unknowns.linear)
@@ -114,7 +113,7 @@ def summarise_fit(
 
 
 def _modal_mass(fit: JointFit) -> dict:
-    """The modal mass that damping is relative to, in kg, and whether it is the model's."""
+    """The modal mass (kg) that damping refers to, and whether it was identified."""
     mass = float(fit.problem.modal_mass_of(fit.unknowns))
     prior = fit.prior.linear.item(-1)
     return {
@@ -146,7 +145,7 @@ def write_joint_fit(path: FilePath, fit: JointFit) -> None:
 def read_joint_fit(path: FilePath) -> JointFit:
     """Read a joint fit that `write_joint_fit` wrote.
 
-    Raises `ValueError` when the file is none, and what opening it raises.
+    Raises `ValueError` for a file that is no joint fit, and as `read_text` does.
     """
     try:
         content = json.loads(read_text(path))
@@ -156,12 +155,12 @@ def read_joint_fit(path: FilePath) -> JointFit:
         raise ValueError(f"{path} is no joint fit of format {_FORMAT}.")
     fit = _decoded(content.get("fit"))
     if not isinstance(fit, JointFit):
-        raise ValueError(f"{path} is no joint fit: it holds another thing.")
+        raise ValueError(f"{path} is no joint fit: it contains another object.")
     return fit
 
 
 def _encoded(value: Any) -> Any:
-    """What JSON lacks as an object with one key that says what it is."""
+    """Encode values that JSON lacks as an object whose key gives the type."""
     if isinstance(value, Fact):
         return {"fact": str(value)}
     if isinstance(value, Status):
@@ -177,8 +176,8 @@ def _encoded(value: Any) -> Any:
         }
     if isinstance(value, eqx.Module) or hasattr(value, "_fields"):
         fields = value._fields if hasattr(value, "_fields") else vars(value)
-        held = {name: _encoded(getattr(value, name)) for name in fields}
-        return {"class": _class_name(value), "fields": held}
+        contents = {name: _encoded(getattr(value, name)) for name in fields}
+        return {"class": _class_name(value), "fields": contents}
     if isinstance(value, list | tuple):
         return {"list": [_encoded(item) for item in value]}
     return value
@@ -207,12 +206,12 @@ def _decoded(value: Any) -> Any:
 
 
 def _class(name: str) -> Any:
-    """A class of this package: nothing else is made from a file."""
+    """A class of this package; no other class is created from a file."""
     module, _, qualified = name.partition(":")
     if not module.startswith("snrmjax.") or not qualified.isidentifier():
         raise ValueError(f"a joint fit is not made of {name}.")
     named = getattr(importlib.import_module(module), qualified, None)
-    holds = isinstance(named, type) and issubclass(named, tuple | Status | eqx.Module)
-    if not holds:
+    is_allowed = isinstance(named, type) and issubclass(named, tuple | Status | eqx.Module)
+    if not is_allowed:
         raise ValueError(f"a joint fit is not made of {name}.")
     return named

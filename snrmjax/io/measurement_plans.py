@@ -1,4 +1,4 @@
-"""Plans of measurements as tables to be filled in, and the filled ones."""
+"""Measurement plans as tables to be filled in, and reading of the completed ones."""
 
 import json
 
@@ -20,9 +20,9 @@ _DIGITS = 6  # of planned numbers
 def write_plan(path: FilePath, plan: MeasurementPlan) -> None:
     """Write a plan as a CSV of steady states whose measured columns are empty.
 
-    One row a state and sensor, with the level, frequency and force (or drive voltage) to be set;
-    what is set otherwise is to be corrected there. To be filled in: the velocity's phasor and,
-    where harmonics are asked for, theirs. Standard deviations are those stated of the former test.
+    One row a state and sensor, with the planned level, frequency and force (or drive voltage);
+    correct them where the test deviates. To be filled in: the velocity phasor and, where harmonics
+    are requested, theirs. Standard deviations are those of the previous test.
     """
     states = plan.states
     state, sensor = np.nonzero(np.asarray(states.measured))
@@ -78,7 +78,7 @@ def read_further_states(path: FilePath, model: Structure, first: SteadyStates) -
 
 
 def _check_filled(path: FilePath) -> None:
-    """Refuse a table with an empty field where something was to be measured."""
+    """Refuse a table with an empty field in a measured column."""
     cells = read_cells(path)
     header = read_header(cells)
     cells.require_rows()
@@ -90,9 +90,9 @@ def _check_filled(path: FilePath) -> None:
 
 
 def read_former_answer(path: FilePath) -> FormerAnswer:
-    """The answer of a `diagnosis.json`, that a diagnosis of more states is compared with.
+    """The answer in a `diagnosis.json`, for comparison with a diagnosis of more states.
 
-    Raises `ValueError` for a file that `snrmjax diagnose` has not written.
+    Raises `ValueError` for a file not written by `snrmjax diagnose`.
     """
     file = file_name(path)
     try:

@@ -1,4 +1,4 @@
-"""Models: a structure in and out, as TOML."""
+"""Reading and writing of structures as TOML."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ import tomli_w
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
 from snrmjax.io.structure_matrices import (
-    felt_by_elements,
+    element_participation,
     listed_sensors,
     moving_base,
     structure_of_matrices,
@@ -18,19 +18,19 @@ from snrmjax.io.structure_matrices import (
 )
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
-from snrmjax.model.builders.free_coordinates import felt_first
+from snrmjax.model.attachment import InfluenceVector, between, influence_vector
+from snrmjax.model.builders.free_coordinates import coupled_first
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.effects import SURFACES, effect_class, known_effects, make_effect
 from snrmjax.model.modes import (
     UNSTATED_MODAL_MASS_STD,
-    Beside,
     LinearModes,
     LinearModesStd,
+    OptionalModalData,
     RigidBodyModes,
     linear_modes,
 )
-from snrmjax.model.places import Row, between, row_over_points
 from snrmjax.model.potential import (
     Monomial,
     PolynomialPotential,
@@ -80,9 +80,9 @@ def read_model(path: FilePath) -> Structure:
     counts from zero. The sensors are those of the modes' shapes, in the first mode's order; a
     model without a name takes the file's. A mode may state the 1σ of its linear test:
     `frequency_std_hz`, `damping_ratio_std` and, relative, `modal_mass_std`. Effects act on the mode
-    of interest, or at points by `at` or `between`, in N and m; `normal_at` or `normal_between` say
-    where a contact is pressed. In place of modes a file may have matrices (see `from_matrices`; or
-    `file`, an NPZ or MAT file with such arrays):
+    of interest, or at points by `at` or `between`, in N and m; `normal_at` or `normal_between` give
+    the normal direction of a contact. In place of modes a file may have matrices (see
+    `from_matrices`; or `file`, an NPZ or MAT file with such arrays):
 
         [structure]
         points = ["a", "b"]
@@ -97,8 +97,8 @@ def read_model(path: FilePath) -> Structure:
         stiffness = 100.0
         gap = 0.01
 
-    Returns the structure. Raises `ValueError` that names file, table, key, value and what was
-    expected; a near miss is suggested for an unknown name.
+    Returns the structure. Raises `ValueError` that names file, table, key, value and expectation,
+    with a suggestion for a misspelt name.
     """
     return _read(read_text(path), file_name(path), Path(path))
 
@@ -112,14 +112,14 @@ def _read(text: str, file: str, path: Path) -> Structure:
         for key in _OF_MODES:
             if key in top.entries:
                 raise ValueError(f"{file} has both [structure] and `{key}`: matrices or modes.")
-        made = structure_of_matrices(top, file, path.parent, effects)
-        modes, potential = made.modes, made.potential
+        built = structure_of_matrices(top, file, path.parent, effects)
+        modes, potential = built.modes, built.potential
     else:
         modes = _modes(top, file, effects)
         potential = _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes)
         for k, effect in enumerate(effects, 1):
-            rows = effect.rows if isinstance(effect, AbstractForce) else ()
-            for point, _ in (pair for row in rows if row is not None for pair in row):
+            vectors = effect.rows if isinstance(effect, AbstractForce) else ()
+            for point, _ in (pair for vector in vectors if vector is not None for pair in vector):
                 _check_point(modes, point, f"effect {k} of {file}")
     return structure(
         modes,
@@ -133,15 +133,15 @@ def _read(text: str, file: str, path: Path) -> Structure:
     )
 
 
-def _check_point(modes: LinearModes, point: str, place: str) -> None:
+def _check_point(modes: LinearModes, point: str, location: str) -> None:
     try:
         modes.shape_at(point)
     except ValueError as error:
-        raise ValueError(f"{place} cannot be read: {error}") from error
+        raise ValueError(f"{location} cannot be read: {error}") from error
 
 
 def _numbers(table: TomlTable, required: _Rules, optional: _Rules) -> dict[str, float]:
-    """The numbers of a table that are there, checked."""
+    """The numbers present in a table, checked."""
     table.check_keys(required, optional)
     rules = {key: rule for key, rule in (required | optional).items() if key != "shape"}
     return {key: table.number(key, *rules[key]) for key in rules if key in table.entries}
@@ -164,13 +164,13 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
             if sensor not in shape.entries:
                 near = near_miss(sensor, set(shape.entries) - set(sensors))
                 raise ValueError(
-                    f"{shape.place} lacks the sensor {shown(sensor)}, which mode 1 "
+                    f"{shape.location} lacks the sensor {shown(sensor)}, which mode 1 "
                     f"has{'' if near is None else f' (is it {shown(near)}?)'}."
                 )
         for sensor in shape.entries:
             if sensor not in sensors:
                 raise ValueError(
-                    f"{shape.place} has the sensor {shown(sensor)}, which mode 1 lacks."
+                    f"{shape.location} has the sensor {shown(sensor)}, which mode 1 lacks."
                 )
     mode_shape = np.array([[shape.number(name) for shape in shapes] for name in sensors])
     if not np.any(mode_shape[:, of_interest - 1]):
@@ -181,35 +181,39 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
 
     if not any(m["participation"] or m.get("participation_lag") for m in (*flexible, *rigid)):
         raise ValueError(
-            f"{file} has no mode that the force moves: expected a `participation` other than zero "
-            "of one mode at least."
+            f"{file} has no mode that the force excites: expected a `participation` other than "
+            "zero for at least one mode."
         )
     base = moving_base(top, file)
     if base is not None and rigid_tables:
-        raise ValueError(f"{file} has both [base] and [[rigid_body_mode]]: a base holds it.")
+        raise ValueError(
+            f"{file} has both [base] and [[rigid_body_mode]]: a base constrains rigid-body motion."
+        )
     n, participation = len(flexible), np.array([m["participation"] for m in (*flexible, *rigid)])
-    # Rigid-body modes that elements hold are modes too, of zero frequency.
-    felt = felt_by_elements(effects, sensors, mode_shape[:, n:])
-    turn, n_free = felt_first(felt, np.abs(mode_shape[:, n:]).max(axis=0, initial=0.0))
-    mode_shape[:, n:] = mode_shape[:, n:] @ turn
-    participation[n:] = participation[n:] @ turn
+    # Rigid-body modes coupled to nonlinear elements are kept as modes of zero frequency.
+    coupling_of_elements = element_participation(effects, sensors, mode_shape[:, n:])
+    rotation, n_free = coupled_first(
+        coupling_of_elements, np.abs(mode_shape[:, n:]).max(axis=0, initial=0.0)
+    )
+    mode_shape[:, n:] = mode_shape[:, n:] @ rotation
+    participation[n:] = participation[n:] @ rotation
     coupling = _coupling(top, n, len(rigid))
     if coupling is not None:
-        whole = scipy.linalg.block_diag(np.eye(n), turn)
+        whole = scipy.linalg.block_diag(np.eye(n), rotation)
         coupling = (whole.T @ coupling @ whole)[: n + n_free, : n + n_free]
     n_modes = n + n_free
-    names, watched = sensors, listed_sensors(top, file)
-    if watched is not None:
-        for sensor in watched:
+    names, listed = sensors, listed_sensors(top, file)
+    if listed is not None:
+        for sensor in listed:
             if sensor not in names:
                 near = suggestion(sensor, names)
                 raise ValueError(
                     f"[sensors] of {file} lists {shown(sensor)}, which no mode has{near}."
                 )
-        sensors = tuple(watched)
-    seen = [names.index(sensor) for sensor in sensors]
+        sensors = tuple(listed)
+    sensor_index = [names.index(sensor) for sensor in sensors]
     others = {name: row for name, row in zip(names, mode_shape, strict=True) if name not in sensors}
-    mode_shape = mode_shape[seen]
+    mode_shape = mode_shape[sensor_index]
 
     def stds(key: str, default: float = 0.0) -> list[float]:
         return [mode.get(key, default) for mode in flexible] + [default] * n_free
@@ -228,7 +232,7 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
             stds("damping_ratio_std"),
             stds("modal_mass_std", UNSTATED_MODAL_MASS_STD) if known_mass else None,
         ),
-        beside=Beside(
+        beside=OptionalModalData(
             {name: row[:n_modes].tolist() for name, row in others.items()},
             coupling,
             lag if any(lag := stds("participation_lag")) else None,
@@ -239,14 +243,14 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
 
 
 def _coupling(top: TomlTable, n_modes: int, n_rigid: int) -> np.ndarray | None:
-    """Damping between modes, 1/s; of rigid-body modes behind the others, zero where not stated."""
+    """Damping coupling of the modes, 1/s; rigid-body modes last, zero where not stated."""
     if "damping_coupling" not in top.entries:
         return None
     rows, whole = top.entries["damping_coupling"], n_modes + n_rigid
     if not isinstance(rows, list) or len(rows) not in (n_modes, whole):
         raise top.refusal("damping_coupling", f"{n_modes} rows of numbers, one a mode", rows)
     coupling = [
-        TomlTable({"damping_coupling": row}, f"{top.place}, row {k},").numbers(
+        TomlTable({"damping_coupling": row}, f"{top.location}, row {k},").numbers(
             "damping_coupling", each="mode", count=len(rows)
         )
         for k, row in enumerate(rows, 1)
@@ -256,14 +260,14 @@ def _coupling(top: TomlTable, n_modes: int, n_rigid: int) -> np.ndarray | None:
 
 def _shape(mode: TomlTable) -> TomlTable:
     """The shape of one mode, its value at each sensor, checked."""
-    table = mode.table("shape", f"the shape of {mode.place}")
+    table = mode.table("shape", f"the shape of {mode.location}")
     if not table.entries:
-        raise ValueError(f"{table.place} must have at least one sensor.")
+        raise ValueError(f"{table.location} must have at least one sensor.")
     for sensor in table.entries:
         if sensor != sensor.strip() or sensor == "" or not sensor.isprintable():
             raise ValueError(
                 f"the name of a sensor must be a text without spaces around it, "
-                f"but {table.place} has {sensor!r}."
+                f"but {table.location} has {sensor!r}."
             )
         table.number(sensor)
     return table
@@ -276,13 +280,13 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
         try:
             monomial = parse_monomial(name, n_modes)
         except ValueError as error:
-            raise ValueError(f"{table.place} cannot be read: {error}") from error
+            raise ValueError(f"{table.location} cannot be read: {error}") from error
         if monomial in coefficients:
             raise ValueError(
-                f"{table.place} has the monomial {name!r} twice (the order of the modes is free)."
+                f"{table.location} has the monomial {name!r} twice (the order of modes is free)."
             )
         if isinstance(value, dict):
-            entry = TomlTable(value, f"monomial {name!r} in {table.place}")
+            entry = TomlTable(value, f"monomial {name!r} in {table.location}")
             entry.check_keys(("coefficient",), ("std",))
             coefficients[monomial] = entry.number("coefficient")
             spread[monomial] = entry.number("std", NOT_NEGATIVE, default=0.0)
@@ -293,13 +297,13 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
 
 def _effect(table: TomlTable) -> AbstractEffect:
     if "kind" not in table.entries:
-        raise ValueError(f"{table.place} lacks the key `kind`.")
+        raise ValueError(f"{table.location} lacks the key `kind`.")
     kind, known_kinds = table.text("kind"), tuple(known_effects())
     if kind not in known_kinds:
         near = suggestion(kind, known_kinds) or f" (known are {', '.join(sorted(known_kinds))})"
-        raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}.")
+        raise ValueError(f"{table.location} has the unknown kind {shown(kind)}{near}.")
     wanted = effect_class(kind).parameters()
-    table = TomlTable(table.entries, f"{table.place} ({kind})")
+    table = TomlTable(table.entries, f"{table.location} ({kind})")
     across = ("normal_at", "normal_between") if kind in SURFACES else ()
     table.check_keys(("kind", *wanted), ("at", "between", *across))
     values: dict[str, float | np.ndarray] = {
@@ -309,16 +313,18 @@ def _effect(table: TomlTable) -> AbstractEffect:
         for name, parameter in wanted.items()
     }
     try:
-        return make_effect(kind, values, at=_row(table), normal_at=_row(table, "normal_"))
+        return make_effect(
+            kind, values, at=_influence_vector(table), normal_at=_influence_vector(table, "normal_")
+        )
     except ValueError as error:
-        raise ValueError(f"{table.place} cannot be read: {error}") from error
+        raise ValueError(f"{table.location} cannot be read: {error}") from error
 
 
-def _row(table: TomlTable, side: str = "") -> Row | None:
-    """Where an effect acts: `at` a point or points with weights, `between` two points."""
+def _influence_vector(table: TomlTable, side: str = "") -> InfluenceVector | None:
+    """Influence vector of an effect: `at` a point or weighted points, `between` two points."""
     one, pair = f"{side}at", f"{side}between"
     if one in table.entries and pair in table.entries:
-        raise ValueError(f"{table.place} has both `{one}` and `{pair}`.")
+        raise ValueError(f"{table.location} has both `{one}` and `{pair}`.")
     if pair in table.entries:
         two = table.entries[pair]
         if not isinstance(two, list) or len(two) != 2 or not all(isinstance(p, str) for p in two):
@@ -328,23 +334,23 @@ def _row(table: TomlTable, side: str = "") -> Row | None:
         return between(*two)
     at = table.entries.get(one)
     if at is None or isinstance(at, str):
-        return None if at is None else row_over_points(at)
-    weights = table.table(one, f"`{one}` of {table.place}")
-    return row_over_points({point: weights.number(point) for point in weights.entries})
+        return None if at is None else influence_vector(at)
+    weights = table.table(one, f"`{one}` of {table.location}")
+    return influence_vector({point: weights.number(point) for point in weights.entries})
 
 
 def write_model(path: FilePath, model: Structure) -> None:
     """Write a structure as the TOML that `read_model` reads.
 
-    Numbers are written in full, so that reading gives them back exactly, angular frequencies and
-    phases to one rounding of the unit conversion. The test order is not in it: that is the data's.
-    The file appears whole or not at all.
+    Numbers are written in full precision: reading restores them exactly, angular frequencies and
+    phases to one rounding of the unit conversion. The test order is not included; it belongs to the
+    data. The file is written atomically.
 
-    Raises `ValueError` when a file could not hold the model: the rules of the reader apply.
+    Raises `ValueError` for a model that the reader would refuse.
     """
     if model.modes.natural_frequency.ndim != 1:
         raise ValueError("`model` must be one structure, but is a batch of them.")
-    # A zero without a sign: of matrices of one column its sign is lost in reading.
+    # Without signed zeros: matrices of one column lose the sign of zero in reading.
     unsigned = jax.tree.map(lambda leaf: np.asarray(leaf) + 0.0, model)
     text = tomli_w.dumps(_entries(unsigned))
     _read(text, file_name(path), Path(path))
@@ -362,9 +368,9 @@ def _entries(model: Structure) -> dict[str, object]:
         return dict(zip(names, np.asarray(of).tolist(), strict=False))
 
     flexible: list[dict[str, object]] = []
-    own = np.flatnonzero(modes.natural_frequency).tolist()
+    elastic = np.flatnonzero(modes.natural_frequency).tolist()
     free = np.flatnonzero(np.asarray(modes.natural_frequency) == 0).tolist()
-    for k in own:
+    for k in elastic:
         stds = {
             "frequency_std_hz": in_unit(modes.natural_frequency_std.item(k), HERTZ),
             "damping_ratio_std": modes.damping_ratio_std.item(k),

@@ -1,4 +1,4 @@
-"""Results as tables and as one summary: what the commands write."""
+"""Results as tables and summaries, as the commands write them."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -19,14 +19,14 @@ from snrmjax.simulate.solutions.event_curves import EventCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 from snrmjax.simulate.solutions.quasi_periodic import QuasiPeriodicBranch
 
-if TYPE_CHECKING:  # a simulation does not wait for the imports of an identification
+if TYPE_CHECKING:  # keeps a simulation from importing the identification
     from snrmjax.identify.inference.identification import Identification
     from snrmjax.identify.pointwise.backbone import BackboneValues
     from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
     from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
 
 BACKBONE_POINTS = 200
-# What other programs rely on: the columns of backbone.csv and points.csv, in their order.
+# Fixed interface: the columns of backbone.csv and points.csv, in order.
 _CURVES = (
     *("natural_frequency_hz", "natural_frequency_std_hz", "damping_ratio", "damping_ratio_std"),
 )
@@ -43,21 +43,21 @@ def write_response(
     """Write simulated responses: frequency, velocity at one sensor, stability and events.
 
     `stable` is 1 where a motion is known to be stable and else 0; where stability was not
-    computed, `event` says so with "stability_not_computed". Of several sensors the fundamentals
-    follow in columns with their names. Where a base drives the structure the velocities are those
-    that the sensors record, and a column `base_acceleration_m_s2` stands in place of `force_n`.
+    computed, `event` contains "stability_not_computed". Several sensors have further columns of
+    their fundamentals. For base excitation the velocities are those recorded by the sensors, and
+    `base_acceleration_m_s2` replaces `force_n`.
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` when there is no such sensor or the file cannot be written.
     """
-    r = _place(curves[0].sensors, sensor) if curves else 0
+    r = _sensor_index(curves[0].sensors, sensor) if curves else 0
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
     recorded = [velocity_at_sensors(c, c.force) for c in curves]
     velocity = np.concatenate([v[:, :, r] for v in recorded])
     named = {}
     if curves and len(curves[0].sensors) > 1:
-        for place, name in enumerate(curves[0].sensors):
-            fundamental = np.concatenate([v[:, 1, place] for v in recorded])
+        for index, name in enumerate(curves[0].sensors):
+            fundamental = np.concatenate([v[:, 1, index] for v in recorded])
             named[f"velocity_h1_{name}_re_m_s"] = fundamental.real
             named[f"velocity_h1_{name}_im_m_s"] = fundamental.imag
     columns = {
@@ -85,14 +85,14 @@ def write_event_curves(
     """
     if not curves:
         raise ValueError("there is no curve of events to write.")
-    r = _place(curves[0].sensors, sensor)
-    sizes = [len(c.frequency) for c in curves]
+    r = _sensor_index(curves[0].sensors, sensor)
+    n_points = [len(c.frequency) for c in curves]
     velocity = np.concatenate([velocity_at_sensors(c, c.force)[:, :, r] for c in curves])
     fundamental = velocity[:, 1]
     columns = {
-        "curve": np.repeat(np.arange(len(curves)), sizes),
-        "kind": [c.kind for c, n in zip(curves, sizes, strict=True) for _ in range(n)],
-        "parameter": [c.parameter for c, n in zip(curves, sizes, strict=True) for _ in range(n)],
+        "curve": np.repeat(np.arange(len(curves)), n_points),
+        "kind": [c.kind for c, n in zip(curves, n_points, strict=True) for _ in range(n)],
+        "parameter": [c.parameter for c, n in zip(curves, n_points, strict=True) for _ in range(n)],
         "value": np.concatenate([c.value for c in curves]),
         "force_n": np.concatenate([c.force for c in curves]),
         "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
@@ -109,8 +109,8 @@ def write_quasi_periodic(
 ) -> None:
     """Write branches of quasi-periodic motions: both frequencies, velocity at one sensor.
 
-    The amplitude of the fundamental goes from `velocity_h1_least_m_s` to `velocity_h1_largest_m_s`
-    and back in every `slow_period_s`.
+    The amplitude of the fundamental varies between `velocity_h1_least_m_s` and
+    `velocity_h1_largest_m_s` with the period `slow_period_s`.
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` without a branch, when there is no such sensor or the file cannot be
@@ -118,15 +118,15 @@ def write_quasi_periodic(
     """
     if not branches:
         raise ValueError("there is no branch of quasi-periodic motions to write.")
-    r = _place(branches[0].sensors, sensor)
+    r = _sensor_index(branches[0].sensors, sensor)
 
     def joined(values: str) -> np.ndarray:
         return np.concatenate([getattr(b, values) for b in branches])
 
-    sizes, velocity = [len(b.frequency) for b in branches], joined("velocity")[:, r]
+    n_points, velocity = [len(b.frequency) for b in branches], joined("velocity")[:, r]
     columns = {
-        "branch": np.repeat(np.arange(len(branches)), sizes),
-        "force_n": np.repeat([b.force for b in branches], sizes),
+        "branch": np.repeat(np.arange(len(branches)), n_points),
+        "force_n": np.repeat([b.force for b in branches], n_points),
         "frequency_hz": joined("frequency") / HERTZ,
         "slow_frequency_hz": joined("slow_frequency") / HERTZ,
         "slow_period_s": joined("slow_period"),
@@ -141,7 +141,7 @@ def write_quasi_periodic(
 
 
 def _events(curve: ResponseCurve) -> list[str]:
-    """What happens at every point, unknown stability included."""
+    """Events at every point, including unknown stability."""
     unknown = curve.stability == int(Stability.NOT_COMPUTED)
     return [
         "+".join(filter(None, [event, "stability_not_computed" if missing else ""]))
@@ -154,14 +154,14 @@ def write_normal_mode(
 ) -> None:
     """Write a nonlinear normal mode: frequency, velocity at one sensor, energy, and its shape.
 
-    `stable` is 1 or 0, and empty where it was not computed; `internal_resonance` names the tongue
-    that a point is on. Of several modes their shares of the mean kinetic energy follow, of several
-    sensors their fundamentals, with the sign that they have when the first one's is positive.
+    `stable` is 1 or 0, and empty where not computed; `internal_resonance` names the tongue of a
+    point. Several modes have columns of their fractions of the mean kinetic energy, several sensors
+    of their fundamentals, signed relative to the first one.
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` when there is no such sensor or the file cannot be written.
     """
-    r = _place(branch.sensors, sensor)
+    r = _sensor_index(branch.sensors, sensor)
     known = branch.stability != int(Stability.NOT_COMPUTED)
     columns: dict[str, Any] = {
         "point": np.arange(len(branch.frequency)),
@@ -170,8 +170,8 @@ def write_normal_mode(
         "velocity_peak_m_s": velocity_peaks(branch.velocity[:, :, r]),
         "energy_j": branch.energy,
         "stable": [
-            str(value) if told else ""
-            for value, told in zip(branch.stability.tolist(), known.tolist(), strict=True)
+            str(value) if is_known else ""
+            for value, is_known in zip(branch.stability.tolist(), known.tolist(), strict=True)
         ],
         "internal_resonance": list(branch.resonance),
     }
@@ -183,7 +183,7 @@ def write_normal_mode(
     if len(branch.sensors) > 1:
         shape = branch.shape()
         columns |= {
-            f"velocity_h1_{name}_m_s": shape[:, place] for place, name in enumerate(branch.sensors)
+            f"velocity_h1_{name}_m_s": shape[:, index] for index, name in enumerate(branch.sensors)
         }
     write_table(path, columns)
 
@@ -191,11 +191,11 @@ def write_normal_mode(
 def load_named(
     columns: Mapping[str, Any], unit: str, unbalance: float | None = None
 ) -> dict[str, Any]:
-    """Columns, or entries of a summary, with the force by what it is.
+    """Columns, or entries of a summary, with the excitation named by its kind.
 
-    Arguments: `unit` of what drives the structure: in m/s², of a base, `force_n` is called
-    `base_acceleration_m_s2`. With `unbalance` U (kg m) the forces are multiples of it: `force_n` is
-    then the force at each frequency, and `unbalance_kg_m` the unbalance.
+    Arguments: `unit` of the excitation: for m/s² (base excitation) `force_n` is renamed to
+    `base_acceleration_m_s2`. With `unbalance` U (kg m) the forces are multiples of U Ω²: `force_n`
+    is then the force at each frequency, and `unbalance_kg_m` the unbalance.
     """
     if unbalance is not None:
         kg_m = unbalance * columns["force_n"]
@@ -216,8 +216,8 @@ def write_points(
 
     Arguments: `added` as for `write_values`; `force_unit` as for `load_named`.
     """
-    held = identification.points.variables()
-    columns = load_named({name: held[name].values for name in _POINTS}, force_unit)
+    variables = identification.points.variables()
+    columns = load_named({name: variables[name].values for name in _POINTS}, force_unit)
     write_table(path, _with_amplitude(columns, "backbone_velocity_m_s", added))
 
 
@@ -236,11 +236,11 @@ def write_values(
 ) -> None:
     """Write natural frequency and damping against velocity, with 1σ.
 
-    Arguments: `added` is one more column, another amplitude of the motion: its name in place of
-    "velocity_m_s", and the power of the natural angular frequency that the velocity is times.
+    Arguments: `added` is one more column with another amplitude of the motion: its name in place of
+    "velocity_m_s", and the power of the natural angular frequency that multiplies the velocity.
     """
-    held = values.variables()
-    columns = {name: held[name].values for name in _VALUES}
+    variables = values.variables()
+    columns = {name: variables[name].values for name in _VALUES}
     write_table(path, _with_amplitude(columns, "velocity_m_s", added))
 
 
@@ -264,9 +264,9 @@ def write_prediction(
 ) -> None:
     """Write predicted responses at the backbone's sensor; isolated parts follow the main curve.
 
-    Arguments: `drives` are the drive voltages of the responses in V where the force is known as
-    one: a column `drive_v` has them; `velocity_stds` 1σ of each response's velocity amplitude at
-    fixed frequency in m/s, of a further level: a column `velocity_std_m_s`; `force_unit` as for
+    Arguments: `drives` are the drive voltages of the responses in V, for a force known only as a
+    voltage (column `drive_v`); `velocity_stds` are 1σ of each response's velocity amplitude at
+    fixed frequency in m/s, for a further level (column `velocity_std_m_s`); `force_unit` as for
     `load_named`.
     Raises `ValueError` when the file cannot be written.
     """
@@ -298,7 +298,7 @@ def write_coupled_prediction(
     Raises `ValueError` when the file cannot be written.
     """
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
-    velocity = np.concatenate([c.velocity[:, 1, _place(c.sensors, sensor)] for c in curves])
+    velocity = np.concatenate([c.velocity[:, 1, _sensor_index(c.sensors, sensor)] for c in curves])
     columns = {
         "force_n": force,
         "point": _numbered(force),
@@ -376,8 +376,8 @@ def summarise_distribution(distribution: "ResonanceDistribution") -> dict:
     }
 
 
-def _place(sensors: tuple[str, ...], name: str | None) -> int:
-    """Where a sensor is among all; the first without a name."""
+def _sensor_index(sensors: tuple[str, ...], name: str | None) -> int:
+    """Index of a sensor; the first without a name."""
     if name is not None and name not in sensors:
         raise ValueError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
     return 0 if name is None else sensors.index(name)

@@ -1,7 +1,7 @@
-"""A CSV as columns of checked numbers: what every table of ours is read by.
+"""A CSV as columns of checked numbers, the reader of all our tables.
 
-The rules are those of a table that is to be trusted: a doubtful field is refused by its row, where
-`pandas` would guess (1_000, full-width digits, short rows).
+The rules are strict: a doubtful field is refused with its row, where `pandas` would guess (1_000,
+full-width digits, short rows).
 """
 
 import csv
@@ -23,21 +23,21 @@ _PLAIN_NUMBER = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?")
 
 
 class Row(NamedTuple):
-    """A row's fields, and its place in the file."""
+    """A row's fields and its line number."""
 
     number: int  # of its first line in the file, from one
     fields: list[str]
 
 
 class Cells(NamedTuple):
-    """The rows below a header, read a column at a time."""
+    """The rows below a header, accessed by column."""
 
     names: list[str]  # of the columns, as the header has them
     rows: list[Row]
     file: str
 
     def require_rows(self) -> None:
-        """Raises `ValueError` where there are none, or one is not of the header's width."""
+        """Raises `ValueError` without rows, or where a row's width differs from the header's."""
         width, file = len(self.names), self.file
         for row in self.rows:
             if len(row.fields) != width:
@@ -73,7 +73,7 @@ class Cells(NamedTuple):
     def numbers(
         self, column: str, rules: Sequence[Rule] = (), *, empty_allowed: bool = False
     ) -> Float[np.ndarray, " row"]:
-        """One column as numbers that keep its rules; NaN where a field is empty."""
+        """One column as numbers that satisfy the rules; NaN where a field is empty."""
         texts = self.texts(column)
         empty = ("",) if empty_allowed else ()
         values = _plain_numbers([text for text in texts if text not in empty])
@@ -91,9 +91,9 @@ class Cells(NamedTuple):
 
 
 def _plain_numbers(texts: list[str]) -> Float[np.ndarray, " text"] | None:
-    """All texts as finite numbers, or None where one is none.
+    """All texts as finite numbers, or None where one is no number.
 
-    Of these letters Python makes a number of what is one, and of nothing else.
+    Restricted to these characters, since `float` also accepts 1_000 and full-width digits.
     """
     if not set("".join(texts)) <= set("0123456789+-.eE"):
         return None
@@ -122,17 +122,17 @@ def read_cells(path: FilePath) -> Cells:
 
 
 def header_of(path: FilePath) -> list[str]:
-    """The names in the first line of a CSV that says something, in whatever letters."""
+    """The names in the first non-blank line of a CSV; invalid UTF-8 is replaced."""
     text = read_bytes(path).decode("utf-8-sig", errors="replace")
     first = text.lstrip().split("\n", 1)[0]
     return [name for field in first.split(",") if (name := field.strip().strip('"').strip())]
 
 
 def cells_of(text: str, file: str) -> Cells:
-    """The header and the rows of a CSV's text; `file` as messages name it.
+    """The header and the rows of a CSV's text; `file` is its name in messages.
 
     Raises `ValueError` where it is not a CSV with a header, has a blank line in the middle, or a
-    column twice. Rows are to be looked at by `Cells.require_rows`, once the header is understood.
+    column twice. Check the rows by `Cells.require_rows` once the header is known.
 
     >>> cells_of('level, "sensor" \\r\\n 1,"tip"\\r\\n\\r\\n', "beam.csv").rows
     [Row(number=2, fields=['1', 'tip'])]
@@ -152,20 +152,20 @@ def cells_of(text: str, file: str) -> Cells:
     for k, name in enumerate(names):
         if name and name in names[:k]:
             raise ValueError(
-                f"each column must stand once, but {file} has the column `{shortened_name(name)}` "
+                f"each column must occur once, but {file} has the column `{shortened_name(name)}` "
                 f"twice (columns {names.index(name) + 1} and {k + 1})."
             )
     return Cells(names, rows, file)
 
 
 def shortened_name(name: str) -> str:
-    """A column's name on one line and not too long."""
+    """A column's name, printable and shortened."""
     text = name if name.isprintable() else ascii(name)
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
 def _split(text: str, file: str) -> list[Row]:
-    """The rows of a CSV without spaces around fields and blank lines behind."""
+    """The rows of a CSV without spaces around fields and trailing blank lines."""
     tidy = _SPACE_BEHIND_QUOTES.sub(r"\1", text)
     reader = csv.reader(io.StringIO(tidy, newline=""), strict=True, skipinitialspace=True)
     rows: list[Row] = []
@@ -178,7 +178,7 @@ def _split(text: str, file: str) -> list[Row]:
                 blank = blank or number
             elif blank:
                 raise ValueError(
-                    f"blank lines may only stand at the end, but row {blank} of {file} is blank."
+                    f"blank lines are only allowed at the end, but row {blank} of {file} is blank."
                 )
             else:
                 rows.append(Row(number, stripped))

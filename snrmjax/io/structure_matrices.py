@@ -1,4 +1,4 @@
-"""Structures of a model file that are given by matrices, under [structure]."""
+"""Structures given by matrices, under [structure] of a model file."""
 
 import dataclasses
 import io
@@ -34,10 +34,10 @@ def structure_of_matrices(
 ) -> Structure:
     """The structure of [structure], [force] or [base], and [sensors].
 
-    Matrices stand in the table or in a file beside it: NPZ or MAT with arrays `mass`, `stiffness`,
-    `points` and perhaps `damping`. A sparse one in an NPZ file is stored by the arrays of
-    `scipy.sparse.save_npz`, here `mass_data`, `mass_indices`, …; or each in a file of its own that
-    `save_npz` wrote, by its name: `mass = "mass.npz"`; their points are x1, x2, … where not named.
+    Matrices are in the table or in a separate file: NPZ or MAT with arrays `mass`, `stiffness`,
+    `points` and optionally `damping`. A sparse one in an NPZ file has the arrays of
+    `scipy.sparse.save_npz`, here `mass_data`, `mass_indices`, …; or each is in its own `save_npz`
+    file, given by name: `mass = "mass.npz"`; the points are then x1, x2, … unless named.
     Raises `ValueError` that names file, table and key.
     """
     table = top.table("structure", f"[structure] of {file}")
@@ -46,16 +46,16 @@ def structure_of_matrices(
     if "file" in parts:
         for key in (*_MATRICES, "points"):
             if key in parts:
-                raise ValueError(f"{table.place} has both `file` and `{key}`.")
+                raise ValueError(f"{table.location} has both `file` and `{key}`.")
         parts |= _arrays(folder / table.text("file"), table)
     in_files = [key for key in _MATRICES if isinstance(parts.get(key), str)]
     for key in in_files:
         parts[key] = _sparse_file(folder / table.text(key), key, table)
     if "damping" in parts and "damping_ratio" in parts:
-        raise ValueError(f"{table.place} has both `damping` and `damping_ratio`.")
+        raise ValueError(f"{table.location} has both `damping` and `damping_ratio`.")
     for key in ("mass", "stiffness", *(() if in_files else ("points",))):
         if key not in parts:
-            raise ValueError(f"{table.place} lacks the key `{key}`.")
+            raise ValueError(f"{table.location} lacks the key `{key}`.")
     matrices = {key: _matrix(key, parts[key], table) for key in _MATRICES if key in parts}
     points = parts.get("points", [f"x{k + 1}" for k in range(matrices["mass"].shape[0])])
     if not isinstance(points, list) or not all(isinstance(p, str) and p.strip() for p in points):
@@ -63,7 +63,7 @@ def structure_of_matrices(
     try:
         check_names(points, matrices["mass"].shape[0])
     except ValueError as error:
-        raise ValueError(f"{table.place} cannot be read: {error}") from error
+        raise ValueError(f"{table.location} cannot be read: {error}") from error
     damping: Any = matrices.get("damping")
     if "damping_ratio" in parts:
         damping = table.number("damping_ratio", BELOW_ONE)
@@ -72,7 +72,7 @@ def structure_of_matrices(
         raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
     force = None if base else top.table("force", f"[force] of {file}")
     at = {} if force is None else _force(force)
-    watched, n_modes = listed_sensors(top, file), None
+    sensors, n_modes = listed_sensors(top, file), None
     if "modes" in parts:
         n_modes = table.whole("modes", 1)
         if n_modes > len(points):
@@ -80,14 +80,14 @@ def structure_of_matrices(
                 "modes", f"between 1 and {len(points)}, the number of unknowns", n_modes
             )
     _check_named(points, at, f"`at` in [force] of {file}")
-    _check_named(points, watched or (), f"`points` in [sensors] of {file}")
+    _check_named(points, sensors or (), f"`points` in [sensors] of {file}")
     _check_named(points, dict(base.along if base else ()), f"`along` in [base] of {file}")
     for k, effect in enumerate(effects, 1):
-        rows = effect.rows if isinstance(effect, AbstractForce) else ()
-        named = [point for row in rows if row is not None for point, _ in row]
+        vectors = effect.rows if isinstance(effect, AbstractForce) else ()
+        named = [point for vector in vectors if vector is not None for point, _ in vector]
         _check_named(points, named, f"effect {k} of {file}")
     try:
-        made = from_matrices(
+        built = from_matrices(
             *(matrices["mass"], damping, matrices["stiffness"], points),
             force=at or None,
             base=base,
@@ -96,44 +96,48 @@ def structure_of_matrices(
             else None,
             effects=effects,
             n_modes=n_modes,
-            sensors=watched,
+            sensors=sensors,
             name=top.text("name", folder.stem),
         )
     except ValueError as error:
-        raise ValueError(f"{table.place} cannot be read: {error}") from error
+        raise ValueError(f"{table.location} cannot be read: {error}") from error
     of_interest = top.whole("mode_of_interest", 1, 1)
-    if of_interest > made.n_modes:
+    if of_interest > built.n_modes:
         raise top.refusal(
-            "mode_of_interest", f"from 1 to the number of modes ({made.n_modes})", of_interest
+            "mode_of_interest", f"from 1 to the number of modes ({built.n_modes})", of_interest
         )
-    chosen = dataclasses.replace(made.modes, mode_of_interest=of_interest - 1)
-    return dataclasses.replace(made, modes=chosen)
+    chosen = dataclasses.replace(built.modes, mode_of_interest=of_interest - 1)
+    return dataclasses.replace(built, modes=chosen)
 
 
-def _check_named(points: list[str], named: Iterable[str], place: str) -> None:
+def _check_named(points: list[str], named: Iterable[str], location: str) -> None:
     for point in named:
         if point not in points:
             near = suggestion(point, points) or f"; known are {', '.join(points[:12])}"
-            raise ValueError(f"{place} names the point {shown(point)}, which does not exist{near}.")
+            raise ValueError(
+                f"{location} names the point {shown(point)}, which does not exist{near}."
+            )
 
 
 def moving_base(top: TomlTable, file: str) -> BaseMotion | None:
-    """The base of [base]; None where a force drives the structure."""
+    """The base motion of [base]; None for force excitation."""
     if "base" not in top.entries:
         return None
     table = top.table("base", f"[base] of {file}")
     table.check_keys(("motion",), ("along",))
-    said = table.text("motion")
-    motion = next((kind for kind in MOTIONS if kind == said), None)
+    stated = table.text("motion")
+    motion = next((kind for kind in MOTIONS if kind == stated), None)
     if motion is None:
-        raise table.refusal("motion", "what the sensors record, absolute or relative", said)
-    along = table.table("along", f"`along` of {table.place}") if "along" in table.entries else None
+        raise table.refusal("motion", "what the sensors record, absolute or relative", stated)
+    along = (
+        table.table("along", f"`along` of {table.location}") if "along" in table.entries else None
+    )
     cosines = {} if along is None else {point: along.number(point) for point in along.entries}
     return base_motion(motion, cosines)
 
 
 def unbalance(top: TomlTable, file: str) -> float | None:
-    """The unbalance of [force], kg m; None where a force drives the modes."""
+    """The unbalance of [force], kg m; None for a prescribed force."""
     if "force" not in top.entries:
         return None
     table = top.table("force", f"[force] of {file}")
@@ -147,18 +151,18 @@ def unbalance(top: TomlTable, file: str) -> float | None:
     return table.number("unbalance_kg_m", POSITIVE)
 
 
-def felt_by_elements(
+def element_participation(
     effects: Sequence[AbstractEffect], names: Sequence[str], rigid: np.ndarray
 ) -> np.ndarray:
-    """What every element feels of rigid-body modes with shapes at named points."""
+    """Participation wᵀφ of rigid-body modes in each nonlinear element, (element, mode)."""
     forces = [effect for effect in effects if isinstance(effect, AbstractForce)]
-    rows = [dict(row) for force in forces for row in force.rows if row is not None]
-    weights = np.array([[row.get(name, 0.0) for name in names] for row in rows])
+    vectors = [dict(vector) for force in forces for vector in force.rows if vector is not None]
+    weights = np.array([[vector.get(name, 0.0) for name in names] for vector in vectors])
     return weights.reshape(-1, len(names)) @ rigid
 
 
 def listed_sensors(top: TomlTable, file: str) -> list[str] | None:
-    """The points that [sensors] lists; None where nothing does."""
+    """The points listed in [sensors]; None without the table."""
     if "sensors" not in top.entries:
         return None
     table = top.table("sensors", f"[sensors] of {file}")
@@ -174,67 +178,67 @@ def listed_sensors(top: TomlTable, file: str) -> list[str] | None:
 def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
     """Arrays of an NPZ or MAT file by name; points as a list of names."""
     if not path.is_file():
-        raise table.refusal("file", "a file beside the model's", path.name)
-    reading = {".npz": _of_npz, ".mat": _of_mat}.get(path.suffix.lower())
-    if reading is None:
+        raise table.refusal("file", "a file next to the model's", path.name)
+    reader = {".npz": _of_npz, ".mat": _of_mat}.get(path.suffix.lower())
+    if reader is None:
         raise table.refusal("file", "an .npz or .mat file", path.name)
     try:
-        arrays = dict(reading(path))
+        arrays = dict(reader(path))
     except _UNREADABLE as error:
         kind = f"an {path.suffix[1:].upper()} file of arrays (MAT up to version 7)"
         raise ValueError(
-            f"{shown(path.name)} of {table.place} cannot be read: it is damaged or not {kind}; a "
-            "sparse matrix, which `numpy.savez` keeps as an object, goes into a file of its own by "
-            '`scipy.sparse.save_npz`, and here by `mass = "mass.npz"`.'
+            f"{shown(path.name)} of {table.location} cannot be read: it is damaged or not {kind}; "
+            "a sparse matrix, which `numpy.savez` stores as an object, needs its own file by "
+            '`scipy.sparse.save_npz`, stated as `mass = "mass.npz"`.'
         ) from error
-    found = {key: arrays[key] for key in (*_MATRICES, "points") if key in arrays}
-    if "points" in found:
-        names = np.ravel(found["points"])
-        found["points"] = [
+    selected = {key: arrays[key] for key in (*_MATRICES, "points") if key in arrays}
+    if "points" in selected:
+        names = np.ravel(selected["points"])
+        selected["points"] = [
             str(np.ravel(name)[0] if np.size(name) else "").strip() for name in names
         ]
-    return found
+    return selected
 
 
 def _of_mat(path: Path) -> Mapping[str, Any]:
-    """The arrays of a file, which is checked: a damaged one ends the process within scipy."""
+    """The arrays of a file, checked first, since a damaged file can crash scipy."""
     with damaged_if_it_fails(path.name, "a MAT file"):
         content, names = path.read_bytes(), None
         if content.startswith(b"MATLAB 5"):
             names = [one.name for one in checked_variables(content) if not one.object_class]
-        found: dict[str, Any] = scipy.io.loadmat(path, variable_names=names)
-        for value in filter(scipy.sparse.issparse, found.values()):
+        variables: dict[str, Any] = scipy.io.loadmat(path, variable_names=names)
+        for value in filter(scipy.sparse.issparse, variables.values()):
             value.check_format()
-        return found
+        return variables
 
 
 def _of_npz(path: Path) -> Mapping[str, Any]:
-    """The arrays of a file; those of a sparse matrix, by names that begin alike, as the matrix."""
+    """The arrays of a file, with those of a sparse matrix (common prefix) assembled."""
     with np.load(path) as arrays:
-        found: dict[str, Any] = {key: arrays[key] for key in arrays.files}
+        contents: dict[str, Any] = {key: arrays[key] for key in arrays.files}
     for key in _MATRICES:
-        parts = {name: found[f"{key}_{name}"] for name in _SPARSE if f"{key}_{name}" in found}
-        if key not in found and "data" in parts:
-            # `save_npz` has another name for each: what it reads is what it wrote.
+        parts = {name: contents[f"{key}_{name}"] for name in _SPARSE if f"{key}_{name}" in contents}
+        if key not in contents and "data" in parts:
+            # Rename the arrays as in `save_npz`, so that `load_npz` assembles the matrix.
             parts.setdefault("format", np.array("csr" if "indptr" in parts else "coo"))
             file = io.BytesIO()
             np.savez(file, **parts)
             file.seek(0)
-            found[key] = scipy.sparse.load_npz(file)
-    return found
+            contents[key] = scipy.sparse.load_npz(file)
+    return contents
 
 
 def _sparse_file(path: Path, key: str, table: TomlTable) -> Any:
     """The matrix of a file that `scipy.sparse.save_npz` wrote."""
     if not path.is_file():
         raise table.refusal(
-            key, "rows of numbers, or the name of a file beside the model's", path.name
+            key, "rows of numbers, or the name of a file next to the model's", path.name
         )
     try:
         return scipy.sparse.load_npz(path)
     except _UNREADABLE as error:
         raise ValueError(
-            f"`{key}` = {shown(path.name)} of {table.place} cannot be read: it is not a sparse "
+            f"`{key}` = {shown(path.name)} of {table.location} cannot be read: it is not a sparse "
             "matrix by `scipy.sparse.save_npz`."
         ) from error
 
@@ -257,13 +261,13 @@ def _force(table: TomlTable) -> dict[str, complex]:
     at = table.entries["at"]
     if isinstance(at, str):
         return {at: 1.0}
-    weights = table.table("at", f"`at` in {table.place}")
+    weights = table.table("at", f"`at` in {table.location}")
     if not weights.entries:
         raise table.refusal("at", "a point, or points with newtons per newton", at)
     force: dict[str, complex] = {}
     for point, value in weights.entries.items():
         if isinstance(value, dict):
-            entry = weights.table(point, f"{shown(point)} in {weights.place}")
+            entry = weights.table(point, f"{shown(point)} in {weights.location}")
             entry.check_keys(("amplitude",), ("phase_deg",))
             phase = entry.number("phase_deg", default=0.0) * DEGREE
             force[point] = entry.number("amplitude", NOT_ZERO) * np.exp(1j * phase)

@@ -1,4 +1,4 @@
-"""Tables: steady states in and out, and results out, as CSV."""
+"""Steady states read from and written to CSV, and results written to CSV."""
 
 import csv
 import dataclasses
@@ -48,20 +48,20 @@ def read_steady_states(
 ) -> SteadyStates:
     """Read measured steady states from a CSV, one row a steady state and sensor.
 
-    Rows of the same level, frequency, force (or drive voltage) and test order are one state seen
-    by several sensors; a sensor that comes again starts a new state. Files are in Hz and degrees,
+    Rows of the same level, frequency, force (or drive voltage) and test order are one state
+    measured by several sensors; a repeated sensor starts a new state. Files are in Hz and degrees,
     the result is in rad/s and rad. An empty field in an optional column is "not stated". In place
     of the two parts of the velocity's phasor a table may have `velocity_m_s`, the amplitude of its
     fundamental: the phases are then unknown (`SteadyStates.phase_unknown`). In place of a force it
-    may have the acceleration of a base, whose motion is taken away where the model's `[base]` says
-    that the sensors record it too.
+    may have the acceleration of a base, whose motion is subtracted where the model's `[base]`
+    states absolute sensors.
 
-    Arguments: `model` is the structure that was measured, whose sensors the table must have; in
-    its place `sensors` may name them. Without either the sensors are those of the table, in the
-    order in which they appear, and of a base's acceleration velocities are kept as they stand.
+    Arguments: `model` is the measured structure, whose sensors the table must have; alternatively
+    `sensors` names them. Without either, the sensors are those of the table in order of appearance,
+    and velocities measured with a base acceleration are not changed.
     Returns the steady states with the sensors in the model's order;
-    their `notes` say what of the file was not used or not stated.
-    Raises `ValueError` that names file, row, column, value and what was expected.
+    their `notes` report what was not used or not stated.
+    Raises `ValueError` that names file, row, column, value and expectation.
 
     Typical use: `data = read_steady_states("measured.csv", read_model("model.toml"))`.
     """
@@ -75,13 +75,13 @@ def read_steady_states(
 
 
 def check_driven_alike(data: SteadyStates, modes: LinearModes, file: str) -> None:
-    """Refuse a force where the model has a base, the other way round, and one on other modes."""
+    """Refuse an excitation other than the model's, or none of the mode of interest."""
     one = modes.mode_of_interest
     if not modes.driven()[one]:
         raise ValueError(
             f"{file} is a test of mode {one + 1}, the model's `mode_of_interest`, which its force "
-            f"does not move (`participation` {modes.participation.item(one):g}): expected another "
-            "`mode_of_interest`, or the participation of this one."
+            f"does not excite (`participation` {modes.participation.item(one):g}): expected "
+            "another `mode_of_interest`, or the participation of this one."
         )
     if (data.base is None) == (modes.base is None):
         return
@@ -93,7 +93,7 @@ def check_driven_alike(data: SteadyStates, modes: LinearModes, file: str) -> Non
         )
     column = "drive_v" if np.isfinite(np.asarray(data.drive)).any() else "force_n"
     raise ValueError(
-        f"{file} has `{column}`, but the model's [base] says that a base moves it: expected the "
+        f"{file} has `{column}`, but the model has base excitation ([base]): expected the "
         f"columns `{BASE[0]}` and `{BASE[1]}`."
     )
 
@@ -123,25 +123,25 @@ def _read(
     if "harmonic_std_m_s" in columns and not header.harmonic_order:
         notes.append(Fact("error_of_no_harmonics", file=file))
     if AMPLITUDE in header.used:
-        size = cells.numbers(AMPLITUDE, FORCES["force_n"])
+        amplitude = cells.numbers(AMPLITUDE, FORCES["force_n"])
         notes.append(Fact("amplitudes_without_phases", file=file))
         if "phase_std_deg" in columns:
             notes.append(Fact("error_of_no_phases", file=file))
-        columns["phase_std_deg"] = np.full(len(size), NO_PHASE / DEGREE)
-        columns |= dict(zip(PHASOR, (size, np.zeros(len(size))), strict=True))
+        columns["phase_std_deg"] = np.full(len(amplitude), NO_PHASE / DEGREE)
+        columns |= dict(zip(PHASOR, (amplitude, np.zeros(len(amplitude))), strict=True))
     if unbalance is not None and header.used.isdisjoint((*FORCES, *BASE)):
         columns["force_n"] = unbalance * (HERTZ * columns["frequency_hz"]) ** 2
     velocity = _phasors(*(columns[name] for name in PHASOR))
     if not np.any(velocity):
-        raise ValueError(f"{file} has nothing but zero velocities.")
+        raise ValueError(f"{file} has only zero velocities.")
 
     names, sensor = _sensors(cells, sensors)
     force = "drive_v" if "drive_v" in columns else "force_n"
-    moved = BASE[0] in columns
-    if moved and not np.all(columns[BASE[0]] ** 2 + columns[BASE[1]] ** 2 > 0):
+    base_excited = BASE[0] in columns
+    if base_excited and not np.all(columns[BASE[0]] ** 2 + columns[BASE[1]] ** 2 > 0):
         row = int(np.argmin(columns[BASE[0]] ** 2 + columns[BASE[1]] ** 2))
         raise cells.refusal(BASE[0], f"above zero together with `{BASE[1]}`", row)
-    loads = BASE if moved else (force,)
+    loads = BASE if base_excited else (force,)
     key_columns = [columns[name] for name in ("level", "frequency_hz", *loads)]
     if "order" in columns:
         key_columns.append(np.nan_to_num(columns["order"], nan=-1.0))
@@ -164,7 +164,7 @@ def _read(
     not_stated = np.full(len(sensor), np.nan)
     level = columns["level"][first_row].astype(np.int64)
     frequency = columns["frequency_hz"][first_row] * HERTZ
-    beside: OptionalColumns = {
+    optional_columns: OptionalColumns = {
         "measured": per_sensor(np.ones(len(sensor), dtype=bool), False),
         "velocity_std": per_sensor(columns.get("velocity_std_m_s", not_stated)),
         "phase_std": per_sensor(columns.get("phase_std_deg", not_stated)) * DEGREE,
@@ -175,8 +175,8 @@ def _read(
         "harmonic_std": per_sensor(columns.get("harmonic_std_m_s", not_stated)),
         "harmonic_order": header.harmonic_order,
     }
-    if moved:
-        # What the sensors record is only known with a model: as if relative without one.
+    if base_excited:
+        # Without a model, treat the sensors as relative: velocities stay unchanged.
         known = base or BaseMotion("relative")
         data = base_excited_states(
             *(level, frequency, _phasors(*(columns[name][first_row] for name in BASE))),
@@ -184,12 +184,12 @@ def _read(
             sensors=names,
             along=dict(known.along),
             relative=known.motion == "relative",
-            **beside,
+            **optional_columns,
         )
     else:
         newtons = columns["force_n"][first_row] if force == "force_n" else np.full(n_states, np.nan)
         data = steady_states(
-            level, frequency, newtons, per_sensor(velocity, 0.0), sensors=names, **beside
+            level, frequency, newtons, per_sensor(velocity, 0.0), sensors=names, **optional_columns
         )
     return dataclasses.replace(data, notes=tuple(notes))
 
@@ -218,7 +218,7 @@ def _phasors(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:
 def _force_std(
     cells: Cells, columns: Mapping[str, np.ndarray], state: Sequence[int]
 ) -> np.ndarray | None:
-    """The standard deviation of the force of every state, on which its rows must agree."""
+    """The force standard deviation of every state, which must be equal in its rows."""
     name = BASE_STD if BASE_STD in columns else "force_std_n"
     if name not in columns:
         return None
@@ -234,7 +234,7 @@ def _force_std(
 
 
 def _sensors(cells: Cells, sensors: tuple[str, ...] | None) -> tuple[tuple[str, ...], list[int]]:
-    """The sensors of the result, and the index of each row's."""
+    """The sensors of the result, and the sensor index of each row."""
     if not cells.has("sensor"):
         if sensors is not None and len(sensors) != 1:
             listed = ", ".join(f"`{name}`" for name in sensors)
@@ -260,10 +260,10 @@ def _sensors(cells: Cells, sensors: tuple[str, ...] | None) -> tuple[tuple[str, 
 
 
 def group_states(keys: Iterable[Sequence[float]], sensor: Iterable[int]) -> list[int]:
-    """The state of each row: rows with one key and different sensors share it.
+    """The state of each row: rows with equal key and different sensors share it.
 
-    The n-th row of a sensor with some key belongs to the n-th state with that key, so that the
-    rows may be sorted by state or by sensor.
+    The n-th row of a sensor with a key belongs to the n-th state with that key, so that rows may
+    be sorted by state or by sensor.
 
     Arguments: for each row its `keys` (level, frequency, force or drive, order) and `sensor`.
     Returns state numbers from zero, in the order in which the states first appear.
@@ -284,19 +284,19 @@ def group_states(keys: Iterable[Sequence[float]], sensor: Iterable[int]) -> list
 def write_steady_states(path: FilePath, data: SteadyStates) -> None:
     """Write steady states as the CSV that `read_steady_states` reads, one row a state and sensor.
 
-    Numbers are written in full, so that reading gives them back exactly, angular frequencies and
-    phases to one rounding of the unit conversion. Columns in which nothing is stated are left out.
+    Numbers are written in full precision: reading restores them exactly, angular frequencies and
+    phases to one rounding of the unit conversion. Columns without values are left out.
 
     Arguments: `data` with the forces of all states, or with the drive voltages of all where no
-    force is known. Voltages beside known forces are left out: a file has one of both. Of a
-    moving base the acceleration is written, and the velocities that the sensors recorded.
-    Raises `ValueError` when a file could not hold the data: the rules of the reader apply.
+    force is known; voltages in addition to forces are left out. For base excitation the base
+    acceleration and the recorded velocities are written.
+    Raises `ValueError` for data that the reader would refuse.
     """
     write_atomically(path, _table_text(_fields(data, file_name(path))))
 
 
 def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
-    """The fields of a table of steady states by column, as text; `file` as messages name it."""
+    """The fields of a table of steady states by column, as text; `file` is its name in messages."""
     host: SteadyStates = jax.tree.map(np.asarray, as_recorded(data))
     if not np.all(np.any(host.measured, axis=1)):
         raise ValueError("each steady state must be measured by a sensor, but one is by none.")
@@ -336,7 +336,7 @@ def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
     back = _read(_table_text(columns), file, host.sensors)
     if back.n_states != data.n_states or not np.array_equal(back.measured, host.measured):
         raise ValueError(
-            f"{file} could not tell some steady states apart that have the same level, "
+            f"{file} could not distinguish some steady states that have the same level, "
             "frequency and force, but different sensors: give each its own `order`."
         )
     return columns
@@ -347,15 +347,15 @@ def _in_units(values: np.ndarray | jax.Array, unit: float) -> list[str]:
 
 
 def steady_states_of_fields(columns: Mapping[str, Sequence[str]], file: str) -> SteadyStates:
-    """Steady states of a table's fields: text by column, under the rules of the CSV.
+    """Steady states from a table's fields (text by column), under the rules of the CSV.
 
-    Raises `ValueError` as `read_steady_states` does; rows are counted from the header on.
+    Raises `ValueError` as `read_steady_states` does; row numbers include the header.
     """
     return _read(_table_text(columns), file, None)
 
 
 def _texts(values: Iterable[SupportsFloat]) -> list[str]:
-    """Numbers in full; an empty field where a number is not stated."""
+    """Numbers in full precision; an empty field for NaN."""
     return ["" if np.isnan(value) else repr(value) for value in map(float, values)]
 
 
@@ -364,11 +364,11 @@ def write_table(
 ) -> None:
     """Write results as a CSV: a header row, commas, `\\n` line ends, 12 significant digits.
 
-    The file appears whole or not at all. NaN is written as `nan`, a truth value as 0 or 1, an
-    integer and a text as they are.
+    The file is written atomically. NaN is written as `nan`, a boolean as 0 or 1, integers and texts
+    unchanged.
 
     Arguments: `columns` maps the name of each column to its values, all of one length.
-    Raises `ValueError` for columns of unequal length or values that are no number and no text,
+    Raises `ValueError` for columns of unequal length, for values that are neither number nor text,
     and when the file cannot be written.
     """
     fields = {}
@@ -383,7 +383,7 @@ def write_table(
 
 
 def _field(name: str, value: object) -> str:
-    """A value as tables show it."""
+    """A value as text of a table."""
     item = value.item() if isinstance(value, np.generic | jax.Array) else value
     if isinstance(item, str):
         return item

@@ -1,4 +1,4 @@
-"""Tables of a TOML file whose errors name file, table, key, value and what was expected."""
+"""Tables of a TOML file, with errors that name file, table, key, value and expectation."""
 
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -10,7 +10,7 @@ from snrmjax.numerics.rules import Rule
 
 
 def parsed_toml(text: str, file: str) -> "TomlTable":
-    """The top of a TOML file. Raises `ValueError` that names the file where it is none."""
+    """The top-level table of a TOML file. Raises `ValueError` that names an invalid file."""
     try:
         return TomlTable(tomllib.loads(text), file)
     except tomllib.TOMLDecodeError as error:
@@ -22,29 +22,29 @@ def parsed_toml(text: str, file: str) -> "TomlTable":
 
 
 class TomlTable(NamedTuple):
-    """A table of the file and its place as messages name it."""
+    """A table of a file, with its location for messages."""
 
     entries: Mapping[str, object]
-    place: str
+    location: str
 
     def refusal(self, key: str, expected: str, value: object) -> ValueError:
         """The error for one value."""
-        return ValueError(f"`{key}` must be {expected}, but {self.place} has {shown(value)}.")
+        return ValueError(f"`{key}` must be {expected}, but {self.location} has {shown(value)}.")
 
     def check_keys(self, required: Iterable[str], optional: Iterable[str] = ()) -> None:
-        """Refuse keys that are not known and the lack of required ones."""
+        """Refuse unknown keys and missing required ones."""
         required = tuple(required)
         missing = [key for key in required if key not in self.entries]
         known = (*required, *optional)
         for key in self.entries:
             if key not in known:
                 near = suggestion(key, missing) or suggestion(key, known)
-                raise ValueError(f"{self.place} has the unknown key {shown(key)}{near}.")
+                raise ValueError(f"{self.location} has the unknown key {shown(key)}{near}.")
         if missing:
-            raise ValueError(f"{self.place} lacks the key `{missing[0]}`.")
+            raise ValueError(f"{self.location} lacks the key `{missing[0]}`.")
 
     def number(self, key: str, *rules: Rule, default: float | None = None) -> float:
-        """A finite number that keeps its rules."""
+        """A finite number that satisfies the rules."""
         if default is not None and key not in self.entries:
             return default
         value = self.entries[key]
@@ -60,14 +60,14 @@ class TomlTable(NamedTuple):
     def numbers(
         self, key: str, *rules: Rule, each: str = "knot", count: int | None = None
     ) -> list[float]:
-        """A list of finite numbers that keep their rules; messages call one of them `each`."""
+        """A list of finite numbers that satisfy the rules; messages call one of them `each`."""
         value = self.entries[key]
         if not isinstance(value, list):
             raise self.refusal(key, "a list of numbers", value)
         if count is not None and len(value) != count:
             raise self.refusal(key, f"{count} numbers, one a {each}", value)
         return [
-            TomlTable({key: number}, f"{self.place}, {each} {k},").number(key, *rules)
+            TomlTable({key: number}, f"{self.location}, {each} {k},").number(key, *rules)
             for k, number in enumerate(value, 1)
         ]
 
@@ -77,7 +77,7 @@ class TomlTable(NamedTuple):
         if not isinstance(value, list) or not value:
             raise self.refusal(key, "a list of mode numbers, at least one", value)
         entries = (
-            TomlTable({key: number}, f"{self.place}, entry {k},")
+            TomlTable({key: number}, f"{self.location}, entry {k},")
             for k, number in enumerate(value, 1)
         )
         numbers = tuple(entry.whole(key, 1) for entry in entries)
@@ -86,7 +86,7 @@ class TomlTable(NamedTuple):
         return numbers
 
     def numbers_of_modes(self, key: str, count: int, *rules: Rule) -> list[float] | None:
-        """A number for each mode, or one for all; None where it is not stated."""
+        """A number for each mode, or one for all; None where not stated."""
         if key not in self.entries:
             return None
         if isinstance(self.entries[key], list):
@@ -108,21 +108,21 @@ class TomlTable(NamedTuple):
         return value
 
     def choice(self, key: str, known: Iterable[str], default: str | None = None) -> str:
-        """A text out of those known."""
+        """One of the known texts."""
         known, value = tuple(known), self.text(key, default)
         if value not in known:
             near = suggestion(value, known)
             if near:
-                raise ValueError(f"{self.place} has the unknown `{key}` {shown(value)}{near}.")
+                raise ValueError(f"{self.location} has the unknown `{key}` {shown(value)}{near}.")
             raise self.refusal(key, f"one of {', '.join(known)}", value)
         return value
 
-    def table(self, key: str, place: str) -> "TomlTable":
+    def table(self, key: str, location: str) -> "TomlTable":
         """A table inside this one."""
         value = self.entries.get(key, {})
         if not isinstance(value, dict):
             raise self.refusal(key, "a table", value)
-        return TomlTable(value, place)
+        return TomlTable(value, location)
 
     def tables(self, key: str, file: str) -> list["TomlTable"]:
         """A list of tables at the top of a file."""

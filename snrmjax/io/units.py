@@ -1,4 +1,4 @@
-"""Units of the files, for numbers that are rad/s and rad inside."""
+"""Units of the files, for numbers that are in rad/s and rad internally."""
 
 import math
 
@@ -12,9 +12,9 @@ DEGREE = math.pi / 180.0
 def in_unit(value: float, unit: float) -> float:
     """The number to write for `value` in a file whose unit is `unit`.
 
-    The quotient can miss by a rounding the number that gave `value` when it was read; among the
-    neighbours that read back as `value` exactly, the shortest is taken, so that a file which is
-    read and written again keeps its numbers.
+    The quotient may differ by a rounding from the number that was read as `value`; of the
+    neighbours that read back exactly as `value`, the shortest is used, so that a file that is read
+    and written again keeps its numbers.
 
     Arguments: `value` in rad/s or rad, `unit` likewise. Returns the number in that unit; read
     back, it is `value` to one rounding, and exactly so when `value` itself came from a file.

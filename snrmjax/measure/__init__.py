@@ -1,4 +1,4 @@
-"""What a test gives: steady states, records, harmonics, indicators, force calibration."""
+"""Test data: steady states, records, harmonics, indicators, force calibration."""
 
 import lazy_loader
 

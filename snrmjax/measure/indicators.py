@@ -1,4 +1,4 @@
-"""Indicators that say how close a measured steady state is to a (non)linear resonance."""
+"""Indicators of how close a measured steady state is to a (non)linear resonance."""
 
 import equinox as eqx
 import jax
@@ -15,21 +15,21 @@ def nnm_appropriation(
     velocity_amplitudes: Complex[Array, "*batch sensor harmonic"] | Complex[Array, " harmonic"],
     orders: tuple[int, ...],
 ) -> Float[Array, "*batch"]:
-    """Nonlinear normal mode appropriation indicator: 1 when the motion is at its resonance.
+    """Nonlinear normal mode appropriation indicator: 1 at phase resonance.
 
     Δ = (1/N) Σ_k Re{X_k}ᵀRe{X_k} / X_kᴴX_k, where the X_k are displacements relative to a sine
-    force. With velocities relative to a cosine force X_k = V_k e^{−ikπ/2}/(ikΩ), so that the part
-    which counts is Re V_k for odd k and Im V_k for even k; the frequency cancels. For the
+    force. With velocities relative to a cosine force X_k = V_k e^{−ikπ/2}/(ikΩ), so that the
+    relevant part is Re V_k for odd k and Im V_k for even k; the frequency cancels. For the
     fundamental of one sensor Δ is cos² of the velocity phase, and for that of several it is the
     mode indicator of Eq. (21).
 
-    Arguments: `velocity_amplitudes` in m/s (any unit), one column a harmonic of `orders`; a vector
-    is taken as one sensor. NaN means not measured: such entries are left out, and so is a harmonic
+    Arguments: `velocity_amplitudes` in m/s (any unit), one column per harmonic of `orders`; a
+    vector is one sensor. NaN means not measured: such entries are ignored, and so are a harmonic
     that is exactly zero at every sensor, and harmonic 0, which has no phase.
-    Returns a number from 0 to 1; NaN when no harmonic counts. Differentiable.
-    Raises `ValueError` when `orders` does not fit.
-    Validity: every harmonic weighs the same, however small it is; harmonics that are only noise
-    pull Δ towards one half.
+    Returns a number from 0 to 1; NaN without any harmonic. Differentiable.
+    Raises `ValueError` when `orders` does not match.
+    Validity: every harmonic has the same weight, however small it is; harmonics of pure noise
+    bias Δ towards one half.
     Reference: Kwarta & Allen, Eqs. (20) and (21).
 
     >>> nnm_appropriation(jnp.array([1.0 + 1.0j, 0.01j]), (1, 2)).round(12)
@@ -61,11 +61,11 @@ def _appropriation(
 
 @compiled
 def appropriation_of(data: SteadyStates) -> Float[Array, " state"]:
-    """Appropriation indicator of every measured state, from all harmonics it was measured with.
+    """Appropriation indicator of every measured state, from all its measured harmonics.
 
     Eq. (20) over the fundamental (`velocity`) and the stored `harmonics`, without harmonic 0.
 
-    Returns one number per state; NaN for a state that no sensor measured. Differentiable.
+    Returns one number per state; NaN for a state without any measurement. Differentiable.
     Reference: Kwarta & Allen, Eq. (20).
 
     >>> from snrmjax.measure.states import steady_states
@@ -88,10 +88,10 @@ def appropriation_of(data: SteadyStates) -> Float[Array, " state"]:
 def _aligned_and_total(
     amplitudes: Complex[Array, "*batch sensor harmonic"], odd: np.ndarray
 ) -> tuple[Float[Array, "*batch harmonic"], Float[Array, "*batch harmonic"]]:
-    """Sums over the sensors of the squared part at resonance and of the squared magnitude."""
+    """Sums over the sensors of the squared in-phase part and of the squared magnitude."""
     measured = jnp.isfinite(amplitudes)
     values = jnp.where(measured, amplitudes, 0.0)
-    # Scaled, so that the squares of tiny amplitudes do not vanish.
+    # Scaled, so that the squares of tiny amplitudes do not underflow.
     largest = jnp.max(jnp.abs(values), axis=-2, keepdims=True, initial=0.0)
     values = values / jax.lax.stop_gradient(jnp.where(largest > 0, largest, 1.0))
     part = jnp.where(odd, values.real, values.imag)

@@ -1,4 +1,4 @@
-"""Whether recorded phasors are velocities relative to the force, or seem to mean something else."""
+"""Check whether recorded phasors are velocities relative to the force, or something else."""
 
 import dataclasses
 import functools
@@ -15,27 +15,35 @@ from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.facts import Fact
 
 _LEAST_STATES = 6
-_NEAR = 0.2  # of a level's largest |V|/F: states that are nearer to resonance than others
+_NEAR = 0.2  # of a level's largest |V|/F, for a state to count as near resonance
 _POWERS = (0, 2, -1, 4, 1)  # of the amplitude, in the curves of stiffness and damping
-_PER_TERM = 5  # states for each of them
-_WRONG, _RIGHT = 0.25, 0.15  # relative misfit of the phasors: as given above, otherwise read below
-_DAMPED = 0.25  # mean cosine of the phase near resonance, at least, of another reading
-_BETTER, _AS_GOOD = 3.0, 1.5  # ratios of misfits: of another reading at least; of equal ones
-_WRONG_SIZE = 10.0  # ratio of modal constants, that no law of amplitude passes for
+_PER_TERM = 5  # states per power
+_WRONG, _RIGHT = (
+    0.25,
+    0.15,
+)  # relative misfit of the phasors: least as given, largest as interpreted
+_DAMPED = 0.25  # least mean cosine of the phase near resonance, of another interpretation
+_BETTER, _AS_GOOD = (
+    3.0,
+    1.5,
+)  # ratios of misfits: to prefer another interpretation; to count as equal
+_WRONG_SCALE = 10.0  # ratio of modal constants beyond any amplitude dependence
 
 
-class _Reading(NamedTuple):
-    """A velocity that recorded phasors V may stand for: i^n V, or i^n V* where conjugated."""
+class _Interpretation(NamedTuple):
+    """The velocity that recorded phasors V may represent: i^n V, or i^n V* if conjugated."""
 
     conjugated: bool
     quarter_turns: int  # n
 
 
-_READINGS = tuple(_Reading(conjugated, n) for conjugated in (False, True) for n in (0, 1, -1, 2))
+_INTERPRETATIONS = tuple(
+    _Interpretation(conjugated, n) for conjugated in (False, True) for n in (0, 1, -1, 2)
+)
 
 
 class _NearResonance(NamedTuple):
-    """States of the sensor that moves most, with the sign of the model's mode there."""
+    """States of the sensor with the largest shape, with the sign of the model's mode there."""
 
     phase: Float[np.ndarray, " state"]  # rad, of V relative to the force and that sign
     mobility: Float[np.ndarray, " state"]  # |V|/F
@@ -44,7 +52,7 @@ class _NearResonance(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """A single mode fitted to the phasors read in one way."""
+    """A single mode fitted to the phasors under one interpretation."""
 
     misfit: float  # relative, rms
     constant: float  # 1/m, the modal constant
@@ -52,18 +60,18 @@ class _Fit(NamedTuple):
 
 
 def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[Fact, ...]:
-    """A fact where measured phases are clearly not those of a velocity relative to the force.
+    """Detect measured phases that are clearly not those of a velocity relative to the force.
 
     Near resonance a single mode has F cos φ = d(a)|V| and ΩF sin φ = (k(a) − mΩ²)|V|, with m and
-    d(a) above zero and smooth functions of the amplitude a. Both are fitted by linear least
-    squares to the phases as given and to seven other readings: conjugated, turned by ±90°
+    d(a) positive and smooth functions of the amplitude a. Both are fitted by linear least squares
+    to the phases as given and to seven other interpretations: conjugated, rotated by ±90°
     (displacement or acceleration in place of velocity) or 180° (sign of a sensor or of the force),
-    and both. Where the phases as given are clearly refuted and another reading clearly fits, that
-    one is named, or all where several fit alike.
+    and both. If the phases as given clearly do not fit and another interpretation clearly does,
+    that one is named, or all that fit equally well.
 
-    Arguments: `data` measured states, `modes` whose shape and participation give the sign of a
+    Arguments: `data` measured states, `modes` whose shape and participation give the sign of the
     velocity at resonance. Returns no fact or one. Not differentiable.
-    Validity: one resonance; states on both sides of it, or else conjugation cannot be told.
+    Validity: one resonance; states on both sides of it, otherwise conjugation is not detected.
     """
     modes = modes_of(modes)
     if isinstance(data.velocity, jax.core.Tracer) or data.sensors != modes.sensors:
@@ -75,23 +83,23 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[Fa
     near = _near_resonance(data, r, constant)
     if near is None:
         return ()
-    fits = [_fitted(near, reading) for reading in _READINGS]
+    fits = [_fitted(near, one) for one in _INTERPRETATIONS]
     misfit = np.array([fits[0].misfit, *(_of_a_damped_mode(fit) for fit in fits[1:])])
     best = float(misfit.min())
     known = bool(np.any(np.isfinite(np.asarray(data.force))))
     if best > _RIGHT or misfit[0] < max(_WRONG, _BETTER * best):
-        return _wrong_size(near, fits[0], abs(constant)) if known else ()
-    alike = [_READINGS[k] for k in np.flatnonzero(misfit <= _AS_GOOD * best)]
+        return _wrong_scale(near, fits[0], abs(constant)) if known else ()
+    alike = [_INTERPRETATIONS[k] for k in np.flatnonzero(misfit <= _AS_GOOD * best)]
     fractions = {"as_given": float(misfit[0]), "read_so": best}
     if len(alike) > 1:
         return (Fact("phases_misread_alike", readings=tuple(map(tuple, alike)), **fractions),)
-    size = fits[_READINGS.index(alike[0])].constant / abs(constant) if known else np.nan
+    ratio = fits[_INTERPRETATIONS.index(alike[0])].constant / abs(constant) if known else np.nan
     omega, turns = float(near.frequency.mean()), alike[0].quarter_turns
-    # Over the model's constant: what displacements or accelerations in place of velocities need.
+    # Displacements or accelerations in place of velocities change the constant by a factor ω.
     instead = ""
-    if turns == 1 and size < omega**-0.5:
+    if turns == 1 and ratio < omega**-0.5:
         instead = "displacement"
-    elif turns == -1 and omega**0.5 < size < np.inf:
+    elif turns == -1 and omega**0.5 < ratio < np.inf:
         instead = "acceleration"
     same_sign = constant > 0
     return (
@@ -105,22 +113,24 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[Fa
     )
 
 
-def _wrong_size(near: _NearResonance, fit: _Fit, constant: float) -> tuple[Fact, ...]:
-    """A fact where velocity over force is not that of the model's modal mass by far.
+def _wrong_scale(near: _NearResonance, fit: _Fit, constant: float) -> tuple[Fact, ...]:
+    """Detect a ratio of velocity to force far from that of the model's modal mass.
 
-    Only where states away from resonance refute that mass: at resonance any will do.
+    Only with states away from resonance: at resonance any modal mass fits.
     """
     ratio = fit.constant / constant
-    if fit.misfit > _RIGHT or not np.isfinite(ratio) or 1 / _WRONG_SIZE < ratio < _WRONG_SIZE:
+    if fit.misfit > _RIGHT or not np.isfinite(ratio) or 1 / _WRONG_SCALE < ratio < _WRONG_SCALE:
         return ()
-    held = _fitted(near, _READINGS[0], mass=near.frequency.mean() * near.mobility.max() / constant)
-    if held.misfit < max(_WRONG, _BETTER * fit.misfit):
+    with_given_mass = _fitted(
+        near, _INTERPRETATIONS[0], mass=near.frequency.mean() * near.mobility.max() / constant
+    )
+    if with_given_mass.misfit < max(_WRONG, _BETTER * fit.misfit):
         return ()
     return (
         Fact(
             "velocity_over_force_off",
             ratio=float(ratio),
-            as_given=held.misfit,
+            as_given=with_given_mass.misfit,
             with_own_mass=fit.misfit,
         ),
     )
@@ -146,13 +156,17 @@ def _near_resonance(data: SteadyStates, r: int, constant: float) -> _NearResonan
 
 
 def _of_a_damped_mode(fit: _Fit) -> float:
-    """The misfit, infinite where no damping shows: any phases fit far from resonance."""
+    """The misfit, infinite without visible damping: far from resonance any phases fit."""
     return fit.misfit if fit.cosine > _DAMPED else np.inf
 
 
-def _fitted(near: _NearResonance, reading: _Reading, mass: float | None = None) -> _Fit:
+def _fitted(
+    near: _NearResonance, interpretation: _Interpretation, mass: float | None = None
+) -> _Fit:
     phasor = np.exp(1j * near.phase)
-    phasor = 1j**reading.quarter_turns * (phasor.conj() if reading.conjugated else phasor)
+    phasor = 1j**interpretation.quarter_turns * (
+        phasor.conj() if interpretation.conjugated else phasor
+    )
     mean, most = near.frequency.mean(), near.mobility.max()
     relative, ratio = near.mobility / most, near.frequency / mean
     terms = np.clip(len(ratio) // _PER_TERM, 1, len(_POWERS))
@@ -163,7 +177,7 @@ def _fitted(near: _NearResonance, reading: _Reading, mass: float | None = None) 
         mass, sine = _least_squares(np.column_stack([stiffness, -inertia]), phasor.imag)
     else:
         sine = _least_squares(stiffness, phasor.imag + mass * inertia)[1] - mass * inertia
-    if mass <= 0:  # none that a mode can have
+    if mass <= 0:  # impossible for a mode
         mass, sine = 0.0, _least_squares(stiffness, phasor.imag)[1]
     cosine = np.maximum(_least_squares(curve, phasor.real)[1], 0.0)
     misfit = np.sqrt(np.mean((phasor.imag - sine) ** 2 + (phasor.real - cosine) ** 2))
@@ -175,38 +189,38 @@ def _least_squares(
     columns: Float[np.ndarray, "state term"], values: Float[np.ndarray, " state"]
 ) -> tuple[float, Float[np.ndarray, " state"]]:
     """The last column's coefficient and the values of the fit."""
-    size = np.linalg.norm(columns, axis=0)
-    coefficients = np.linalg.lstsq(columns / size, values, rcond=1e-10)[0] / size
+    norm = np.linalg.norm(columns, axis=0)
+    coefficients = np.linalg.lstsq(columns / norm, values, rcond=1e-10)[0] / norm
     return float(coefficients[-1]), columns @ coefficients
 
 
 Arguments = ParamSpec("Arguments")
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
 class MisreadPhases(ValueError):
-    """A verb's refusal of data whose phases are wrong; `facts` are those of `wrong_phases`."""
+    """Rejection of data with wrong phases by an analysis; `facts` are those of `wrong_phases`."""
 
     def __init__(self, facts: tuple[Fact, ...], reason: ValueError) -> None:
         super().__init__(f"{facts[0]} As the data are: {reason}")
         self.facts = facts
 
 
-def naming_wrong_phases(verb: Callable[Arguments, Found]) -> Callable[Arguments, Found]:
-    """A verb that says first what is wrong with the phases of its data, if anything is.
+def naming_wrong_phases(verb: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Decorate an analysis to report wrong phases of its data first.
 
-    In the `notes` of what it returns, or in place of its `ValueError` by `MisreadPhases`.
+    In the `notes` of its result, or by `MisreadPhases` in place of its `ValueError`.
     """
 
     @functools.wraps(verb)
-    def named(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Found:
+    def named(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         given: tuple[object, ...] = (*args, *kwargs.values())
         data = [argument for argument in given if isinstance(argument, SteadyStates)]
         modes = [argument for argument in given if isinstance(argument, LinearModes | Structure)]
         wrong = wrong_phases(data[0], modes[0]) if data and modes else ()
         try:
             result: Any = verb(*args, **kwargs)
-        except MisreadPhases:  # said by a verb within this one
+        except MisreadPhases:  # raised by a nested analysis
             raise
         except ValueError as error:
             if wrong:
@@ -214,6 +228,6 @@ def naming_wrong_phases(verb: Callable[Arguments, Found]) -> Callable[Arguments,
             raise
         if wrong:
             result = dataclasses.replace(result, notes=(*wrong, *result.notes))
-        return cast(Found, result)
+        return cast(Result, result)
 
     return named

@@ -1,4 +1,4 @@
-"""Signals made of harmonics: their synthesis, their peaks and their loops with the force."""
+"""Harmonic signals: synthesis, peak values and force-velocity loops."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,11 +18,11 @@ def synthesise(
     frequency: float | Float[Array, ""],
     time: Float[Array, " sample"],
 ) -> Float[Array, "*batch sample"]:
-    """Signal of given harmonics, x(t) = Re Σ_k X_k e^{ikΩt}.
+    """Signal from its harmonics, x(t) = Re Σ_k X_k e^{ikΩt}.
 
-    Arguments: `amplitudes` in any unit, one column a harmonic of `orders`; `frequency` Ω in rad/s;
+    Arguments: `amplitudes` in any unit, one column per order of `orders`; `frequency` Ω in rad/s;
     `time` in s. Returns the unit of `amplitudes`; differentiable.
-    Raises `ValueError` when `orders` does not fit.
+    Raises `ValueError` when `orders` does not match.
 
     >>> synthesise(jnp.array([2.0, 1j]), (0, 1), 1.0, jnp.array([0.0, jnp.pi / 2])).round(12)
     Array([2., 1.], dtype=float64)
@@ -40,9 +40,9 @@ def peak_amplitude(
 
     The largest of 32 samples per period of the highest harmonic, refined by Newton's method.
 
-    Arguments: `amplitudes` in any unit, one column a harmonic of `orders` (order 0 counts when it
-    is listed). Returns the unit of `amplitudes`. Raises `ValueError` when `orders` does not fit.
-    Validity: differentiable, twice, except where two peaks are equally high; there the gradient
+    Arguments: `amplitudes` in any unit, one column per harmonic of `orders` (order 0 is used if
+    listed). Returns the unit of `amplitudes`. Raises `ValueError` when `orders` does not match.
+    Validity: twice differentiable, except where two peaks are equally high; there the gradient
     is that of one of them.
 
     >>> peak_amplitude(jnp.array([3.0 + 4.0j]), (1,)).round(12)
@@ -61,8 +61,8 @@ def _peak(
     spacing = 2 * jnp.pi / n_samples
 
     def derivative(amplitude: Array, angle: Array, power: int) -> Array:
-        turned = amplitude * (1j * order) ** power * jnp.exp(1j * angle[..., None] * order)
-        return jnp.sum(turned, axis=-1).real
+        terms = amplitude * (1j * order) ** power * jnp.exp(1j * angle[..., None] * order)
+        return jnp.sum(terms, axis=-1).real
 
     def newton_step(amplitude: Array, angle: Array) -> Array:
         curvature = derivative(amplitude, angle, 2)
@@ -79,16 +79,16 @@ def _peak(
         lambda _, a: jnp.clip(a - newton_step(fixed, a), start - spacing, start + spacing),
         start,
     )
-    # Where the curve is too flat for Newton's method, the sample is the better peak.
+    # If the curve is too flat for Newton's method, the sample is the better estimate.
     refined, sampled = derivative(fixed, angle, 0), derivative(fixed, start, 0)
     angle = jnp.where(jnp.abs(refined) >= jnp.abs(sampled), angle, start)
     sign = jnp.where(sampled < 0, -1.0, 1.0)
-    # One more step, now differentiated: it carries how the peak moves into second derivatives.
+    # One more differentiated step accounts for the shift of the peak in second derivatives.
     return sign * derivative(values, angle - newton_step(values, angle), 0)
 
 
 class ForceVelocityLoop(NamedTuple):
-    """One closed period of force against velocity, and the power that flows in."""
+    """One closed period of force against velocity, and the mean input power."""
 
     phase: Float[Array, " point"]  # Ωt in rad, 0…2π
     force: Float[Array, "*batch point"]  # N
@@ -103,13 +103,13 @@ def force_velocity_loop(
     orders: tuple[int, ...],
     n_points: int = 201,
 ) -> ForceVelocityLoop:
-    """Lissajous figure of a force F cos Ωt and a velocity: a line at the phase resonance.
+    """Lissajous figure of a force F cos Ωt and a velocity: a line at phase resonance.
 
     The mean power is P = ½ F Re V₁, the area of the force-displacement loop over the period.
 
-    Arguments: `force` F in N; `velocity_amplitudes` in m/s relative to the force, one column a
+    Arguments: `force` F in N; `velocity_amplitudes` in m/s relative to the force, one column per
     harmonic of `orders`, which must contain 1; `n_points`, the last repeats the first.
-    Returns `ForceVelocityLoop`. Raises `ValueError` when `orders` does not fit.
+    Returns `ForceVelocityLoop`. Raises `ValueError` when `orders` does not match.
     Reference: Kwarta & Allen, Fig. 2 and Eq. (5b).
 
     >>> force_velocity_loop(2.0, jnp.array([0.5 + 0.1j]), (1,)).mean_power
@@ -130,7 +130,7 @@ def force_velocity_loop(
 def checked_amplitudes(
     name: str, amplitudes: Complex[Array, "*batch harmonic"], orders: tuple[int, ...]
 ) -> Complex[Array, "*batch harmonic"]:
-    """Amplitudes as a complex array, or a `ValueError` when `orders` does not fit their columns."""
+    """Amplitudes as a complex array; raises `ValueError` if `orders` does not match the columns."""
     values = jnp.asarray(amplitudes, dtype=complex)
     if values.ndim == 0 or values.shape[-1] != len(orders) or not orders:
         raise ValueError(
@@ -141,9 +141,9 @@ def checked_amplitudes(
 
 
 def require_orders(name: str, orders: Sequence[int] | Int[np.ndarray, " order"]) -> tuple[int, ...]:
-    """Harmonic orders as a tuple, or a `ValueError` where some are doubled, negative or not whole.
+    """Harmonic orders as a tuple, from a list or an array.
 
-    Lists and arrays of them are as good.
+    Raises `ValueError` for repeated, negative or non-integer ones.
     """
     given = tuple(np.asarray(orders).tolist()) if isinstance(orders, np.ndarray) else tuple(orders)
     whole = all(isinstance(order, int | np.integer) and order >= 0 for order in given)
@@ -153,7 +153,7 @@ def require_orders(name: str, orders: Sequence[int] | Int[np.ndarray, " order"])
 
 
 def require_fundamental(name: str, orders: Sequence[int]) -> tuple[int, ...]:
-    """As `require_orders`, of orders that must hold the fundamental, 1."""
+    """As `require_orders`, for orders that must contain the fundamental, 1."""
     checked = require_orders(name, orders)
     if 1 not in checked:
         raise ValueError(f"`{name}` must contain the fundamental, 1, but is {checked}.")

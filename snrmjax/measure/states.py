@@ -1,4 +1,4 @@
-"""A table of measured steady states: the input of every identification."""
+"""Measured steady states: the input of every identification."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,16 +17,16 @@ from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import DEGREE, HERTZ
 
 PHASE_UNKNOWN = np.pi / 3
-"""1σ of a phase, rad, from which on it counts as unknown.
+"""1σ of a phase, rad, above which it counts as unknown.
 
-Errors are carried to first order, which at a radian says nothing any more: a velocity at
-resonance would pass for anything from cos 60° of its size on.
+Errors are propagated to first order, which is meaningless at a radian: a velocity at resonance
+would be compatible with any in-phase part above cos 60° of its amplitude.
 """
 
 _UNKNOWN_FROM = PHASE_UNKNOWN * (1 - 1e-12)  # rounding of 60°
 
 NO_PHASE = np.pi
-"""1σ, rad, that stands for a phase that was not measured."""
+"""1σ, rad, of a phase that was not measured."""
 
 
 class SteadyStates(AbstractResult):
@@ -35,11 +35,11 @@ class SteadyStates(AbstractResult):
     Phasors e^{+iΩt} relative to the force (velocity phase 0 = phase resonance), peak amplitudes.
     A sensor that did not measure a state has `measured` False and velocity 0. A standard
     deviation that is not stated is NaN. A phase with a 1σ of `PHASE_UNKNOWN` or more is unknown:
-    of such a velocity and of its harmonics the amplitudes alone count. A force known only as a
-    drive voltage is in `drive` and `force` is NaN. Of a structure on a moving base `force` is the
-    amplitude of the base's acceleration in m/s² and velocities are relative to it; `base` says what
-    the sensors recorded. `notes` say what a reader of files did not use
-    or did not find stated. To differentiate by a column, change it with `dataclasses.replace`.
+    only the amplitudes of such a velocity and of its harmonics are used. A force known only as a
+    drive voltage is in `drive` and `force` is NaN. With base excitation `force` is the amplitude
+    of the base acceleration in m/s² and velocities are relative to the base; `base` has the motion
+    that the sensors recorded. `notes` list unused or missing data of files. To differentiate by a
+    column, change it with `dataclasses.replace`.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("state", "sensor", "harmonic", "level")
@@ -52,7 +52,7 @@ class SteadyStates(AbstractResult):
     force: Float[Array, " state"] = quantity("state", "N", "force amplitude")
     # Fundamental, relative to the force.
     velocity: Complex[Array, "state sensor"] = quantity("state sensor", "m/s", "velocity")
-    # NaN in what follows: not stated, not measured; of the drive, that the force is known.
+    # NaN in the following: not stated, not measured; for the drive, that the force is known.
     velocity_std: Float[Array, "state sensor"] = quantity(
         "state sensor", "m/s", "1σ of the amplitude"
     )
@@ -61,7 +61,7 @@ class SteadyStates(AbstractResult):
     drive: Float[Array, " state"] = quantity(
         "state", "V", "drive voltage where the force is unknown"
     )
-    order: Float[Array, " state"] = quantity("state", "1", "place in the test, from 0 to 1")
+    order: Float[Array, " state"] = quantity("state", "1", "position in the test, from 0 to 1")
     harmonics: Complex[Array, "state sensor harmonic"] = quantity(
         "state sensor harmonic", "m/s", "harmonic of the velocity", name="harmonic"
     )
@@ -72,7 +72,7 @@ class SteadyStates(AbstractResult):
     base: BaseMotion | None = eqx.field(static=True, default=None)
 
     def summary(self) -> tuple[str, ...]:
-        """Ranges, what is stated and what is missing."""
+        """Ranges, stated errors and missing data."""
 
         def spans(values: Any, unit: str) -> str:
             finite = np.asarray(values)[np.isfinite(np.asarray(values))]
@@ -88,14 +88,14 @@ class SteadyStates(AbstractResult):
             for name in ("velocity", "phase", "force")
             if np.isfinite(np.asarray(getattr(self, f"{name}_std"))).any()
         ]
-        size = np.where(np.asarray(self.measured), np.abs(np.asarray(self.velocity)), np.nan)
+        amplitude = np.where(np.asarray(self.measured), np.abs(np.asarray(self.velocity)), np.nan)
         missing = int(np.sum(~np.asarray(self.measured)))
         lines = [
             f"SteadyStates: {self.n_states} states of {n_levels} "
             f"level{'s' if n_levels != 1 else ''} at {', '.join(self.sensors)}",
             f"frequency {spans(np.asarray(self.frequency) / HERTZ, 'Hz')}, "
             f"{'force' if self.base is None else 'acceleration of the base'} {load}",
-            f"velocity {spans(size, 'm/s')}",
+            f"velocity {spans(amplitude, 'm/s')}",
             f"errors stated of {', '.join(stated) or 'nothing'}",
         ]
         if missing:
@@ -106,8 +106,8 @@ class SteadyStates(AbstractResult):
 
     def variables(self) -> dict[str, Variable]:
         """The columns of a table of steady states."""
-        seen: Any = np.where(self.measured, self.velocity, np.nan)
-        masked = dataclasses.replace(self, velocity=seen)
+        velocity: Any = np.where(self.measured, self.velocity, np.nan)
+        masked = dataclasses.replace(self, velocity=velocity)
         orders = np.asarray(self.harmonic_order, dtype=int)
         columns = dict(super(SteadyStates, masked).variables())
         if self.base is not None:
@@ -134,39 +134,38 @@ class SteadyStates(AbstractResult):
 
     @property
     def phase_unknown(self) -> Bool[Array, "state sensor"]:
-        """Where a velocity was measured whose amplitude alone is known."""
+        """Measured velocities of which only the amplitude is known."""
         return self.measured & (self.phase_std >= _UNKNOWN_FROM)
 
     def select(self, rows: Bool[np.ndarray, " state"] | Int[np.ndarray, " row"]) -> "SteadyStates":
-        """Some of the states: those where a mask is true, or of these rows in this order."""
+        """Some of the states, by a mask or by row numbers in the given order."""
         return jax.tree.map(lambda column: column[np.asarray(rows)], self)
 
     def renumbered(self, offset: int) -> "SteadyStates":
-        """The same states with `offset` added to their levels, before joining tests."""
+        """The same states with `offset` added to their levels, for joining tests."""
         return eqx.tree_at(lambda data: data.level, self, self.level + offset)
 
 
 class OptionalColumns(TypedDict, total=False):
-    """Columns of a table of steady states that may be left out, as keywords of `steady_states`.
+    """Optional columns of a table of steady states, as keywords of `steady_states`.
 
-    A column that is None is left out. One number a state, or one a state and sensor (a vector
-    where there is one sensor).
+    None means absent. One number per state, or per state and sensor (a vector for one sensor).
     """
 
     measured: Bool[np.ndarray, "state sensor"] | None  # False where a sensor missed a state
     velocity_std: Float[np.ndarray, "state sensor"] | None  # m/s, 1σ of the amplitude
     phase_std: Float[np.ndarray, "state sensor"] | None  # rad, 1σ
     force_std: Float[np.ndarray, " state"] | None  # N, 1σ
-    drive: Float[np.ndarray, " state"] | None  # V, in place of a force that is unknown (NaN)
-    order: Float[np.ndarray, " state"] | None  # place in the test, from 0 to 1
+    drive: Float[np.ndarray, " state"] | None  # V, in place of an unknown force (NaN)
+    order: Float[np.ndarray, " state"] | None  # position in the test, from 0 to 1
     harmonics: Complex[np.ndarray, "state sensor harmonic"] | None  # m/s, relative to the force
     harmonic_std: Float[np.ndarray, "state sensor"] | None  # m/s, rms of a complex error
-    harmonic_order: tuple[int, ...]  # which harmonics `harmonics` has
-    base: BaseMotion | None  # whose acceleration (m/s²) `force` is, velocities being relative to it
+    harmonic_order: tuple[int, ...]  # orders of the columns of `harmonics`
+    base: BaseMotion | None  # base excitation: `force` is its acceleration (m/s²)
 
 
 UNNAMED_SENSOR = ("sensor 1",)
-"""The sensors of a test whose only sensor nobody named: a model's only one may be another word."""
+"""Sensors of a test with a single unnamed sensor, which matches a model with any single one."""
 
 
 def steady_states(
@@ -184,9 +183,8 @@ def steady_states(
     force; further columns by name, those of `OptionalColumns`: `measured`, `velocity_std` (m/s),
     `phase_std` (rad), `force_std` (N), `drive` (V), `order`, `harmonics` (m/s), `harmonic_std`
     (m/s), `harmonic_order` and `base` (see `base_excited_states`). Arrays are copied to the host:
-    no derivatives pass through.
-    Raises `ValueError` naming the argument whose shape does not fit, `TypeError` for a column that
-    does not exist.
+    not differentiable.
+    Raises `ValueError` naming the argument with a wrong shape, `TypeError` for an unknown column.
 
     >>> data = steady_states([1, 1], [500.0, 510.0], [1.0, 1.0], [0.6 + 0.0j, 0.5 - 0.2j])
     >>> data.n_states, data.velocity.shape
@@ -249,12 +247,12 @@ def steady_states(
         sensors=tuple(sensors),
         base=columns.get("base"),
     )
-    # All at once: one by one they compile, a copy of every shape.
+    # In one transfer: one by one, a copy is compiled for every shape.
     return jax.device_put(states, may_alias=False)
 
 
 def check_phases(data: SteadyStates, purpose: str) -> None:
-    """Raise `ValueError` where phases are unknown; `purpose` is what needs them."""
+    """Raise `ValueError` for unknown phases; `purpose` is what needs them."""
     std, measured = value_of(data.phase_std), value_of(data.measured)
     if std is None or measured is None:
         return
@@ -270,7 +268,7 @@ def check_phases(data: SteadyStates, purpose: str) -> None:
 
 
 def check_force(data: SteadyStates, purpose: str) -> None:
-    """Raise `ValueError` where no state has a force; `purpose` is what needs it."""
+    """Raise `ValueError` if no state has a force; `purpose` is what needs it."""
     force = value_of(data.force)
     if force is None or np.any(np.isfinite(force)):
         return
@@ -286,12 +284,11 @@ def check_force(data: SteadyStates, purpose: str) -> None:
 def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyStates:
     """All steady states of several tests of the same structure, in order.
 
-    Arguments: the tests, as separate arguments or as one list. Levels are kept as they are: states
-    of one level are taken to share their errors of gain and phase, so give different tests
-    different levels beforehand (`SteadyStates.renumbered`). Harmonics that a test did not record
-    are not measured in its states.
-    Returns `SteadyStates`. Raises `ValueError` when there is nothing to join, when something is
-    not `SteadyStates`, or when sensors differ.
+    Arguments: the tests, as separate arguments or as one list. Levels are unchanged: states of one
+    level have common errors of gain and phase, so give different tests different levels beforehand
+    (`SteadyStates.renumbered`). Harmonics that a test did not record are NaN in its states.
+    Returns `SteadyStates`. Raises `ValueError` for an empty list, for anything but `SteadyStates`,
+    and for different sensors.
 
     >>> one = steady_states([1], [500.0], [1.0], [0.6 + 0.0j])
     >>> join_steady_states([one, one.renumbered(1)]).level
@@ -314,8 +311,8 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
             )
         if test.base != tests[0].base:
             raise ValueError(
-                "tests can be joined when the same drives them, but one is of a force and another "
-                "of a base's acceleration, or what their sensors record differs."
+                "tests can be joined when they have the same excitation, but one has a force and "
+                "another a base acceleration, or their sensors record different motions."
             )
     notes = tuple(dict.fromkeys(note for test in tests for note in test.notes))
     orders = tuple(sorted({order for test in tests for order in test.harmonic_order}))
@@ -324,47 +321,47 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
 
 
 def with_levels_apart(tests: Iterable[SteadyStates]) -> tuple[SteadyStates, ...]:
-    """Tests whose levels follow one another, so that joined no two of them share one."""
-    apart, offset = [], 0
+    """Tests with consecutive level numbers, so that joined tests have no common level."""
+    renumbered, offset = [], 0
     for test in tests:
         moved = test.renumbered(offset)
         offset = int(moved.level.max())
-        apart.append(moved)
-    return tuple(apart)
+        renumbered.append(moved)
+    return tuple(renumbered)
 
 
 def _with_harmonics(data: SteadyStates, orders: tuple[int, ...]) -> SteadyStates:
-    """The states with room for these harmonics, NaN where they were not recorded."""
+    """The states with columns for these harmonics, NaN where they were not recorded."""
     if data.harmonic_order == orders:
         return data
-    room = jnp.full((*data.velocity.shape, len(orders)), jnp.nan, dtype=data.velocity.dtype)
-    places = np.array([orders.index(order) for order in data.harmonic_order], dtype=int)
-    filled = room.at[:, :, places].set(data.harmonics)
+    columns = jnp.full((*data.velocity.shape, len(orders)), jnp.nan, dtype=data.velocity.dtype)
+    index = np.array([orders.index(order) for order in data.harmonic_order], dtype=int)
+    filled = columns.at[:, :, index].set(data.harmonics)
     return dataclasses.replace(data, harmonics=filled, harmonic_order=orders)
 
 
 def _listed(part: Any) -> list[Any]:
-    """The members of a list; what is no list is its only member, to be refused by its type."""
+    """The members of a list; anything else is its only member, to be rejected by its type."""
     alone = isinstance(part, str | Mapping) or not np.iterable(part)
     return [part] if alone else list(part)
 
 
 def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
-    """Stated 1σ of log force, log velocity and phase; what is not stated is 0 if others are.
+    """Stated 1σ of log force, log velocity and phase; 0 for those not stated if others are.
 
-    A state for which nothing is stated has NaN throughout. NumPy's arrays stay so.
+    NaN throughout for a state without any stated error. NumPy arrays stay NumPy arrays.
     """
     xp: Any = data.velocity.__array_namespace__()
 
-    def over(std: Any, size: Any) -> Any:
-        # What is not stated is kept out of the division: its NaN would pass `where` in a gradient.
-        known = xp.isfinite(std) & (size > 0)
-        return xp.where(known, xp.where(known, std, 0.0) / xp.where(known, size, 1.0), xp.nan)
+    def over(std: Any, amplitude: Any) -> Any:
+        # NaN is kept out of the division, since it would pass `where` in a gradient.
+        known = xp.isfinite(std) & (amplitude > 0)
+        return xp.where(known, xp.where(known, std, 0.0) / xp.where(known, amplitude, 1.0), xp.nan)
 
     amplitude = xp.abs(data.velocity)
     force = xp.broadcast_to(over(data.force_std, data.force)[:, None], amplitude.shape)
     velocity = over(data.velocity_std, amplitude)
-    # A velocity error without a phase error is taken as a circle in the complex plane.
+    # A velocity error without a phase error is assumed circular in the complex plane.
     phase = xp.where(xp.isfinite(data.phase_std), data.phase_std, velocity)
     stated = xp.stack([force, velocity, phase], axis=2)
     something = xp.any(xp.isfinite(stated), axis=2, keepdims=True)

@@ -1,7 +1,7 @@
-"""Other methods that read natural frequency and damping against amplitude, beside the inverse SNRM.
+"""Other identification methods for natural frequency and damping against amplitude.
 
-One file a method, with its source; all answer with a `MethodResult`. `compare_methods` runs those
-that a table of steady states allows and sets them side by side.
+One file per method, with its source; each returns a `MethodResult`. `compare_methods` runs all
+methods that the data allow, the inverse SNRM included, and compares the results.
 """
 
 import lazy_loader

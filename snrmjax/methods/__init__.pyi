@@ -8,8 +8,8 @@ from .records.state_space_fit import fit_state_space
 from .result import MethodStatus
 from .steady.arslan_ozguven import arslan_ozguven
 from .steady.concerto import concerto
+from .steady.controlled_resonances import control_based_continuation, phase_locked_loop
 from .steady.harmonic_force_surface import force_surface, harmonic_force_surface
-from .steady.held_resonances import control_based_continuation, phase_locked_loop
 from .steady.phase_resonance import phase_resonance
 from .steady.rct import rct
 

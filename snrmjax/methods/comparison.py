@@ -1,4 +1,4 @@
-"""The methods that tables of steady states and time records allow, side by side."""
+"""Run all methods that tables of steady states and time records allow, and compare them."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ from snrmjax.numerics.facts import Fact
 
 _log = logging.getLogger(__name__)
 
-_SAMPLES = 41  # of the curves that the inverse method gives
+_SAMPLES = 41  # amplitudes at which the inverse method's curves are evaluated
 
 Method = Callable[[SteadyStates, LinearModes], MethodResult]
 
@@ -43,16 +43,16 @@ Method = Callable[[SteadyStates, LinearModes], MethodResult]
 def snrm(data: SteadyStates, modes: LinearModes) -> MethodResult:
     """The inverse single nonlinear resonant mode method: its curves at 41 amplitudes.
 
-    `identify_backbone` in the form of the other methods; where the force is known only as a drive
-    voltage `fit_jointly`, with the gain and the instrument's phase as unknowns. Arguments: `data`
-    and `modes` as there. Returns a `MethodResult` between the smallest and the largest measured
-    amplitude; 1σ as stated by the data or from the scatter about the curve.
-    Raises `ValueError` as these do.
+    `identify_backbone` as a `MethodResult`; where only the drive voltage is known, `fit_jointly`
+    with the force gain and the instrument phase as unknowns. Arguments: `data` and `modes` as for
+    these functions. Returns a `MethodResult` between the smallest and the largest measured
+    amplitude; 1σ from the stated errors or from the scatter about the curve.
+    Raises `ValueError` as these functions do.
     Reference: Kwarta & Allen, section 2.2.
     """
     if np.isfinite(np.asarray(data.force)).any():
-        found = identify_backbone(data, modes)
-        backbone, notes = found.backbone, found.notes
+        identification = identify_backbone(data, modes)
+        backbone, notes = identification.backbone, identification.notes
     else:
         joint = fit_jointly(data, modes, free=("instrument_phase",))
         backbone, notes = as_backbone(joint), joint.notes
@@ -72,7 +72,7 @@ METHODS: dict[str, Method] = {
     "harmonic_force_surface": harmonic_force_surface,
     "phase_resonance": phase_resonance,
 }
-"""Methods that read a table of steady states, by name."""
+"""Methods for tables of steady states, by name."""
 
 
 class Distance(NamedTuple):
@@ -85,22 +85,22 @@ class Distance(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What each method found, and what stopped those that could not run."""
+    """The methods' results, and why the others could not run."""
 
     results: tuple[MethodResult, ...]
     stopped: dict[str, str]  # method: why
     data: SteadyStates | None = None  # of tables, stepped sines and slow sweeps
-    records: tuple[Fact, ...] = ()  # what each time record was taken for, and why
-    decays: tuple[Fact, ...] = ()  # what lies beside the mode in free decays
+    records: tuple[Fact, ...] = ()  # kind of each time record, and the rule that decided
+    decays: tuple[Fact, ...] = ()  # interfering modes in free decays
 
     @property
     def reference(self) -> MethodResult | None:
-        """From which distances are taken: the inverse SNRM, else the first with points."""
+        """The result that distances refer to: the inverse SNRM, else the first with points."""
         results = [result for result in self.results if result.found.any()]
         return next((r for r in results if r.method == "snrm"), results[0] if results else None)
 
     def distances(self) -> tuple[Distance, ...]:
-        """Of each method from the reference, at amplitudes that this covers."""
+        """Distance of each method from the reference, within the reference's amplitude range."""
         reference = self.reference
         if reference is None:
             return ()
@@ -131,13 +131,12 @@ def compare_methods(
     """Run several methods on the same tests.
 
     Arguments: `data` are steady states, or a list of steady states and time records of one
-    structure. Records are sorted by what they are (`recorded_test` states the rules): stepped
-    sines and slow sweeps become steady states, free decays and broadband records go to the
-    methods of records. Levels of different tests are kept apart. `methods` are names in `METHODS`
-    and `RECORD_METHODS`; by default all that read data of these kinds. A method that the data do
+    structure. Records are classified (`recorded_test` states the rules): stepped sines and slow
+    sweeps become steady states, free decays and broadband records go to the time-domain methods.
+    Levels of different tests are kept apart. `methods` are names in `METHODS` and
+    `RECORD_METHODS`; by default all that accept data of these kinds. A method that the data do
     not allow is in `stopped` with the reason; the others still run.
-    Raises `ValueError` for a name that no method has, and where not one method could run
-    or found anything.
+    Raises `ValueError` for an unknown method, and where no method could run or gave a point.
     Not differentiable: differentiate `snrmjax.identify.identify_points`.
     """
     known = (*METHODS, *RECORD_METHODS)
@@ -147,50 +146,52 @@ def compare_methods(
         raise ValueError(
             f"`methods` must be among {', '.join(known)}, but has {', '.join(unknown)}."
         )
-    read = _read([data] if isinstance(data, SteadyStates) else list(data), modes)
+    sorting = _sorted([data] if isinstance(data, SteadyStates) else list(data), modes)
     results: list[MethodResult] = []
     stopped: dict[str, str] = {}
     absent: dict[str, str] = {}  # methods without data of their kind
     for name in names:
         _log.info("runs the method %s", name)
         if name in RECORD_METHODS:
-            found = run_record_method(name, read.tests, modes)
-            if found.result is not None:
-                results.append(found.result)
+            run = run_record_method(name, sorting.tests, modes)
+            if run.result is not None:
+                results.append(run.result)
             else:
-                (stopped if found.had_data else absent)[name] = found.reason
-        elif read.states is None:
-            if read.without_states:
-                stopped[name] = read.without_states[0]
+                (stopped if run.had_data else absent)[name] = run.reason
+        elif sorting.states is None:
+            if sorting.without_states:
+                stopped[name] = sorting.without_states[0]
             else:
                 absent[name] = "steady states are needed, and the data have none."
         else:
             try:
-                results.append(METHODS[name](read.states, modes))
+                results.append(METHODS[name](sorting.states, modes))
             except ValueError as error:
                 stopped[name] = str(error)
-    if read.unknown:  # a record that nothing can use stops what has no other data
-        absent = dict.fromkeys(absent, read.unknown[-1])
+    if sorting.unknown:  # methods without other data report why a record was rejected
+        absent = dict.fromkeys(absent, sorting.unknown[-1])
     stopped = {name: f"{name}: {why}" for name, why in (stopped | absent).items()}
     if not results:
-        raise ValueError(f"no method could run; {next(iter(stopped.values()), 'none was asked.')}")
+        raise ValueError(f"no method could run; {next(iter(stopped.values()), 'none was given.')}")
     if not any(result.found.any() for result in results):
         why = MethodStatus(int(results[0].status[0])).message
-        raise ValueError(f"no method found anything; {results[0].method}: {why}.")
-    return Comparison(tuple(results), stopped, read.states, read.facts(), read.interfering())
+        raise ValueError(f"no method gave a point; {results[0].method}: {why}.")
+    return Comparison(
+        tuple(results), stopped, sorting.states, sorting.facts(), sorting.interfering()
+    )
 
 
-class _Read(NamedTuple):
-    """Tables and records by what they are."""
+class _Data(NamedTuple):
+    """Tables and records by kind."""
 
     states: SteadyStates | None  # of tables, steps and sweeps
     tests: list[RecordedTest]
-    counts: list[Fact | None]  # of the states of each
-    unknown: list[str]  # why records are of no known kind
-    without_states: list[str]  # why steps and sweeps have no states
+    counts: list[Fact | None]  # number of states from each record
+    unknown: list[str]  # reasons why records are of no known kind
+    without_states: list[str]  # reasons why steps and sweeps give no states
 
     def facts(self) -> tuple[Fact, ...]:
-        """What each record was taken for, why, and how many states it gave."""
+        """Kind of each record, the rule that decided, and its number of states."""
         taken = (
             Fact("record_sorted", name=t.recording.name, kind=t.kind.value, why=t.why, states=n)
             for t, n in zip(self.tests, self.counts, strict=True)
@@ -199,7 +200,7 @@ class _Read(NamedTuple):
         return (*taken, *left_out)
 
     def interfering(self) -> tuple[Fact, ...]:
-        """How the mode of each free decay was isolated, and what else lies in the record."""
+        """How the mode of each free decay was isolated, and its interfering modes."""
         return tuple(
             Fact("note_of_decay", name=test.recording.name, note=note)
             for test in self.tests
@@ -208,27 +209,27 @@ class _Read(NamedTuple):
         )
 
 
-def _read(parts: Sequence[SteadyStates | TimeRecording], modes: LinearModes) -> _Read:
+def _sorted(parts: Sequence[SteadyStates | TimeRecording], modes: LinearModes) -> _Data:
     states = [part for part in parts if isinstance(part, SteadyStates)]
-    read = _Read(None, [], [], [], [])
+    sorting = _Data(None, [], [], [], [])
     for part in parts:
         if isinstance(part, SteadyStates):
             continue
         try:
-            read.tests.append(recorded_test(part, modes))
+            sorting.tests.append(recorded_test(part, modes))
         except ValueError as error:
-            read.unknown.append(str(error))
+            sorting.unknown.append(str(error))
             continue
-        read.counts.append(None)
-        if read.tests[-1].kind is RecordKind.FREE_DECAY:
-            read.tests[-1] = with_decays(read.tests[-1], modes)
-        if read.tests[-1].kind in (RecordKind.STEPPED_SINE, RecordKind.SLOW_SWEEP):
+        sorting.counts.append(None)
+        if sorting.tests[-1].kind is RecordKind.FREE_DECAY:
+            sorting.tests[-1] = with_decays(sorting.tests[-1], modes)
+        if sorting.tests[-1].kind in (RecordKind.STEPPED_SINE, RecordKind.SLOW_SWEEP):
             try:
-                found, read.counts[-1] = states_of(read.tests[-1])
-                states.append(found)
+                of_record, sorting.counts[-1] = states_of(sorting.tests[-1])
+                states.append(of_record)
             except ValueError as error:
-                read.without_states.append(str(error))
+                sorting.without_states.append(str(error))
     if not states:
-        return read
+        return sorting
     joined = states[0] if len(states) == 1 else join_steady_states(with_levels_apart(states))
-    return read._replace(states=joined)
+    return sorting._replace(states=joined)

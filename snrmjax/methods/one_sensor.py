@@ -1,4 +1,4 @@
-"""Steady states as the other methods see them: one sensor, by level, force and displacement."""
+"""Steady states of one sensor, by level, force and displacement, as the other methods need them."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -36,7 +36,7 @@ class SensorStates(NamedTuple):
         return np.angle(self.velocity)
 
     def of(self, rows: Bool[np.ndarray, " state"] | Int[np.ndarray, " row"]) -> "SensorStates":
-        """Some of the states."""
+        """A subset of the states."""
         return SensorStates(*(column[rows] for column in self))
 
     def levels(self) -> Iterator[tuple[int, "SensorStates"]]:
@@ -48,11 +48,11 @@ class SensorStates(NamedTuple):
 def sensor_states(
     data: SteadyStates, modes: LinearModes, *, any_scale: bool = False
 ) -> SensorStates:
-    """The states that a method of one sensor can use, velocities turned to the mode's sign.
+    """The usable states of the reference sensor, with the velocity's sign that of the mode.
 
-    Arguments: with `any_scale` a drive voltage stands for the force where no force was measured,
-    for methods to which the modal constant does not matter.
-    A phase whose error is not stated is as wrong, in rad, as its amplitude is relatively.
+    Arguments: with `any_scale` the drive voltage replaces a force that was not measured, for
+    methods that do not need the modal constant.
+    A phase without stated error gets the relative amplitude error, in rad.
     Raises `ValueError` where no force or no phase was measured, or where the reference sensor is
     not in the data.
     """
@@ -75,25 +75,25 @@ def sensor_states(
     if not phased.any():
         raise ValueError("phases are needed, but the data have amplitudes alone.")
     kept = np.flatnonzero(phased)
-    turn = np.sign(signed_drive_point(modes))
+    sign = np.sign(signed_drive_point(modes))
     velocity_std = np.asarray(data.velocity_std)[kept, at] / np.abs(velocity[kept])
     force_std = np.asarray(data.force_std)[kept] / force[kept]
     return SensorStates(
         np.asarray(data.level)[kept],
         np.asarray(data.frequency)[kept],
         force[kept],
-        turn * velocity[kept],
+        sign * velocity[kept],
         np.hypot(velocity_std, np.where(np.isfinite(force_std), force_std, 0.0)),
         np.where(np.isfinite(phase_std[kept]), phase_std[kept], velocity_std),
     )
 
 
 def signed_drive_point(modes: LinearModes) -> float:
-    """Shape at the reference sensor times participation: 1 / modal mass there, 1/kg, signed."""
+    """Shape at the reference sensor times participation (1 / modal mass there), 1/kg, signed."""
     k = modes.mode_of_interest
     return modes.mode_shape.item(reference_sensor(modes), k) * modes.participation.item(k)
 
 
 def drive_point(modes: LinearModes) -> float:
-    """Velocity of the reference sensor per modal velocity and force: |Φ_r Φᵀb|, 1/kg."""
+    """Modal constant of the reference sensor, |Φ_r Φᵀb|, 1/kg."""
     return abs(signed_drive_point(modes))

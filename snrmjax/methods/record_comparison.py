@@ -1,4 +1,4 @@
-"""The methods that a time record allows: decays, restoring forces, manifolds, state spaces."""
+"""Methods for time records: resonant decay, restoring force, submanifold, state space."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -26,22 +26,21 @@ from snrmjax.methods.result import MethodResult, method_result
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
 
-_LONGEST = 2**22  # samples of a record that these methods hold in memory
+_LONGEST = 2**22  # samples of a record that these methods keep in memory
 
 
-class Found(NamedTuple):
-    """A method's answer to all records of its kind, or why it has none."""
+class MethodRun(NamedTuple):
+    """A method's result for all records of its kinds, or why it has none."""
 
     result: MethodResult | None
     reason: str
-    had_data: bool = True  # records of the kind that it reads
+    had_data: bool = True  # records of its kinds were present
 
 
 def states_of(test: RecordedTest) -> tuple[SteadyStates, Fact]:
-    """Steady states of a stepped sine or a slow sweep at the model's sensors, and how many.
+    """Steady states of a stepped sine or a slow sweep at the model's sensors, and their number.
 
-    Raises `ValueError` that names the record for what `stepped_sine_states` and `sweep_states`
-    refuse.
+    Raises `ValueError`, with the record's name, as `stepped_sine_states` and `sweep_states` do.
     """
     channels = test.channels
     force = channels.force or channels.drive
@@ -61,7 +60,7 @@ def states_of(test: RecordedTest) -> tuple[SteadyStates, Fact]:
 
 
 def with_decays(test: RecordedTest, modes: LinearModes) -> RecordedTest:
-    """A record with the mode of each of its free decays, which methods then share."""
+    """The record with the isolated mode of each free decay, shared by the methods."""
     if test.recording.n_samples > _LONGEST:
         return test
     return test._replace(decays=recorded_decays(test, modes))
@@ -76,7 +75,7 @@ def _of_decays(
     return run
 
 
-def _noted(result: MethodResult, notes: Sequence[Fact]) -> MethodResult:
+def _with_notes(result: MethodResult, notes: Sequence[Fact]) -> MethodResult:
     return dataclasses.replace(result, notes=(*result.notes, *notes))
 
 
@@ -84,10 +83,12 @@ def _restoring_force(test: RecordedTest, modes: LinearModes) -> list[MethodResul
     if test.kind is RecordKind.FREE_DECAY:
         return _of_decays(restoring_force_of_mode)(test, modes)
     channel, whole = _force_channel(test), (0, test.recording.n_samples)
-    seen = recorded_velocity(test.recording, test.channels.reference, test.frequency, whole)
-    force = test.recording.values([channel], seen.start, seen.start + len(seen.time))[0]
-    found = restoring_force(seen.time, seen.velocity, even_record(seen.time, force)[1], modes)
-    return [_noted(found, seen.notes)]
+    motion = recorded_velocity(test.recording, test.channels.reference, test.frequency, whole)
+    force = test.recording.values([channel], motion.start, motion.start + len(motion.time))[0]
+    result = restoring_force(
+        motion.time, motion.velocity, even_record(motion.time, force)[1], modes
+    )
+    return [_with_notes(result, motion.notes)]
 
 
 def _force_channel(test: RecordedTest) -> str:
@@ -97,22 +98,22 @@ def _force_channel(test: RecordedTest) -> str:
 
 
 def _pnlss_of(tests: Sequence[RecordedTest], modes: LinearModes) -> MethodResult:
-    """One model of all realisations and levels; the one next to the largest is predicted."""
+    """One model for all realisations and levels; the second largest is left for validation."""
     if len({(test.channels, test.recording.sampling_rate) for test in tests}) > 1:
         raise ValueError("records of different channels or rates are fitted one by one.")
     force = _force_channel(tests[0])
     records = [test.recording for test in tests]
     if len(records) == 1:
         return pnlss(records, force, tests[0].channels.reference, modes)
-    size = [float(np.std(record.values([force], 0, _LONGEST))) for record in records]
-    first, second, *others = np.argsort(size)[::-1]
+    force_rms = [float(np.std(record.values([force], 0, _LONGEST))) for record in records]
+    first, second, *others = np.argsort(force_rms)[::-1]
     ordered = [records[k] for k in (first, *others, second)]
-    found = pnlss(ordered, force, tests[0].channels.reference, modes)
-    return _noted(found, [Fact("one_model_of_records", n=len(tests))])
+    result = pnlss(ordered, force, tests[0].channels.reference, modes)
+    return _with_notes(result, [Fact("one_model_of_records", n=len(tests))])
 
 
 class RecordMethod(NamedTuple):
-    """A method, the kinds of record that it reads, and how it reads several as one test."""
+    """A method, the kinds of record it accepts, and its function for several records at once."""
 
     run: Callable[[RecordedTest, LinearModes], list[MethodResult]]
     kinds: tuple[RecordKind, ...]
@@ -129,50 +130,52 @@ RECORD_METHODS: dict[str, RecordMethod] = {
         lambda test, modes: [_pnlss_of([test], modes)], (RecordKind.BROADBAND,), _pnlss_of
     ),
 }
-"""Methods that read time records, by name."""
+"""Methods for time records, by name."""
 
 
-def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearModes) -> Found:
+def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearModes) -> MethodRun:
     """Run one of `RECORD_METHODS` on all records of its kinds, as one result.
 
-    Where the method can, records are read as one test; where that fails a note says why, and they
-    are read one by one. A record that it cannot read is named in a note, or in the reason where it
-    can read none.
+    Where the method can, all records are fitted together; where that fails a note gives the reason
+    and they are fitted one by one. A rejected record is named in a note, or in the reason where
+    all are rejected.
     """
     method = RECORD_METHODS[name]
     readable = [test for test in tests if test.kind in method.kinds]
     if not readable:
         wanted = " or ".join(kind.value for kind in method.kinds)
-        return Found(None, f"a time record ({wanted}) is needed, and the data have none.", False)
-    found: list[MethodResult] = []
+        return MethodRun(
+            None, f"a time record ({wanted}) is needed, and the data have none.", False
+        )
+    results: list[MethodResult] = []
     reasons: list[str] = []
     apart: list[Fact] = []
     read: list[RecordedTest] = []
     if method.together is not None and len(readable) > 1:
         try:
-            found, read, readable = [method.together(readable, modes)], readable, []
+            results, read, readable = [method.together(readable, modes)], readable, []
         except ValueError as error:
             apart = [Fact("records_apart", why=str(error))]
     for test in readable:
         try:
             if test.recording.n_samples > _LONGEST:
                 raise ValueError(f"the record has more than {_LONGEST} samples: cut it.")
-            found += method.run(test, modes)
+            results += method.run(test, modes)
             read.append(test)
         except ValueError as error:
             reasons.append(f"{error} ({test.recording.name})")
-    if not found:
-        return Found(None, reasons[0])
+    if not results:
+        return MethodRun(None, reasons[0])
     notes = [
         *(Fact("record_left_out", why=why) for why in reasons),
-        *(note for result in found for note in result.notes),
+        *(note for result in results for note in result.notes),
         *apart,
     ]
-    # The number of the record as level.
+    # The record's number is the level.
     points = [
         point._replace(level=number)
-        for number, result in enumerate(found, 1)
+        for number, result in enumerate(results, 1)
         for point in result.points()
     ]
     seconds = sum(test.recording.duration for test in read)
-    return Found(method_result(name, points, 0, notes, test_seconds=seconds), "")
+    return MethodRun(method_result(name, points, 0, notes, test_seconds=seconds), "")

@@ -1,4 +1,4 @@
-"""What every method answers with: a backbone and damping by points, with what failed and why."""
+"""The result of every method: points of backbone and damping, with the reasons of failures."""
 
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
@@ -14,32 +14,32 @@ Numbers = Float[Array | np.ndarray, " point"]
 
 
 class MethodStatus(Status):
-    """Why a method has, or has not, an answer at an amplitude."""
+    """Whether a method has a result at an amplitude, or why not."""
 
     FOUND = 0, "found"
     NO_RESONANCE = (
         1,
-        "the phase does not pass through resonance: the motion jumped before it, or the level "
+        "the phase does not pass through resonance: the response jumped before it, or the level "
         "ends early",
     )
     ONE_SIDE = 2, "no states of equal amplitude on both sides of resonance"
     TOO_FEW_STATES = 3, "too few states of this amplitude"
-    NOT_A_MODE = 4, "a stiffness or damping came out that is not positive"
+    NOT_A_MODE = 4, "the identified stiffness or damping is not positive"
     AMPLITUDE_HELD = (
         5,
-        "the displacement was held, so that states of equal amplitude are not a pair",
+        "the displacement was controlled, so that states of equal amplitude are not a pair",
     )
     NOT_LOCKED = (
         6,
-        "the controller did not hold its target: other gains, smaller steps or more time",
+        "the controller did not reach its target: try other gains, smaller steps or more time",
     )
 
 
 class MethodPoint(NamedTuple):
-    """One amplitude at which a method was asked: its answer, or why there is none."""
+    """Result of a method at one amplitude, or why there is none."""
 
     status: MethodStatus
-    level: int  # of the test; -1 where it comes from several levels
+    level: int  # of the test; -1 where the point comes from several levels
     velocity: float = np.nan  # m/s, fundamental at resonance, at the reference sensor
     natural_frequency: float = np.nan  # rad/s
     natural_frequency_std: float = np.nan
@@ -48,9 +48,9 @@ class MethodPoint(NamedTuple):
 
 
 class MethodResult(AbstractResult):
-    """Natural frequency and damping against amplitude as one method finds them.
+    """Natural frequency and damping against amplitude by one method.
 
-    Where `status` is not `FOUND` the numbers are NaN. A 1σ that a method does not give, or that
+    Where `status` is not `FOUND` the numbers are NaN. A 1σ that the method does not give, or that
     the data do not state, is NaN. `damping_ratio` is relative to the natural frequency at the
     same amplitude: modal damping / (2 ω̃).
     """
@@ -73,12 +73,12 @@ class MethodResult(AbstractResult):
     status: Int[Array | np.ndarray, " point"] = quantity(
         "velocity_m_s", "", "answer or why there is none", of=MethodStatus
     )
-    n_states: int = setting()  # steady states that it used
-    test_seconds: float = setting(default=np.nan)  # of a test that it ran itself
+    n_states: int = setting()  # steady states used
+    test_seconds: float = setting(default=np.nan)  # duration of the records or virtual test
     notes: tuple[Fact | str, ...] = setting(default=())
 
     def points(self) -> list[MethodPoint]:
-        """The answers one by one."""
+        """The points one by one."""
         rows = zip(
             *(self.status, self.level, self.velocity),
             *(self.natural_frequency, self.natural_frequency_std),
@@ -92,7 +92,7 @@ class MethodResult(AbstractResult):
 
     @property
     def found(self) -> Bool[np.ndarray, " point"]:
-        """Where there is an answer."""
+        """Points with a result."""
         return np.asarray(self.status) == int(MethodStatus.FOUND)
 
 
@@ -103,7 +103,7 @@ def points_of_curves(
     damping_ratio: Numbers,
     damping_ratio_std: Numbers,
 ) -> list[MethodPoint]:
-    """Points of curves over velocity; where the damping is not positive none is a mode."""
+    """Points of curves over velocity; `NOT_A_MODE` where the damping is not positive."""
     columns = (velocity, natural_frequency, natural_frequency_std, damping_ratio, damping_ratio_std)
     return [
         MethodPoint(MethodStatus.FOUND, -1, *map(float, row))
@@ -121,7 +121,7 @@ def method_result(
     *,
     test_seconds: float = np.nan,
 ) -> MethodResult:
-    """A method's points as one result, by rising velocity, those without an answer last."""
+    """A method's points as one result, by rising velocity, those without a result last."""
     kept = sorted(points, key=lambda point: (point.status != MethodStatus.FOUND, point.velocity))
     kinds = {"status": int, "level": int}
     columns = {

@@ -1,3 +1,4 @@
+from .attachment import between
 from .averaging import averaged_effect
 from .builders.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from .builders.matrices import Matrices, beam, chain, from_matrices
@@ -32,7 +33,6 @@ from .modes import (
 )
 from .moving_base import BaseMotion, base_motion
 from .parameters import parameter_names, parameter_values, with_parameters
-from .places import between
 from .potential import PolynomialPotential, polynomial_potential
 from .structures import Structure, equilibria, structure
 

@@ -23,7 +23,7 @@ def averaged_effect(
     *,
     n_samples: int = 512,
 ) -> AveragedForce:
-    """Equivalent stiffness and damping of an effect over one steady cycle, with a memory or not.
+    """Equivalent stiffness and damping of an effect over one steady cycle, hysteretic or not.
 
     Δ(ω̃²) = (1/πQ) ∮ f(Q cos β, −QΩ sin β) cos β dβ and
     Δ(2ζ̃ω̃) = −(1/πQΩ) ∮ f(Q cos β, −QΩ sin β) sin β dβ,
@@ -31,8 +31,8 @@ def averaged_effect(
     the step for a continuous one and for friction.
 
     Arguments: `amplitude` Q in kg^1/2 m, not zero; `frequency` Ω in rad/s. Returns 1/s² and 1/s.
-    First order in the force: harmonics of the response are neglected. Differentiable by all of
-    them and by the effect's parameters.
+    First order in the force: harmonics of the response are neglected. Differentiable with respect
+    to all arguments and the effect's parameters.
     Reference: Kwarta & Allen, Eqs. (9a) and (9b); (9b) as printed contradicts their Eq. (8) for
     linear damping and is corrected here, and (9a) is the first-order root of Δ(ω̃²).
 

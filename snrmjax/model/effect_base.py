@@ -1,10 +1,9 @@
 """Base classes of effects, one for each way in which a model may be incomplete.
 
 A force acts on the mode of interest, or at points of the structure. On the mode of interest f is
-added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with q in kg^1/2 m. At points it acts on their
-displacement x in m and is a force in N, which is then what its parameters are in. Other effects
-change the linear terms, add a mode, add harmonics to the force or change what the instruments
-record.
+added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with q in kg^1/2 m. At points it is a force in N
+that depends on their displacement x in m, and its parameters are in N and m. Other effects change
+the linear terms, add a mode, add harmonics to the force or distort the measured signals.
 """
 
 import dataclasses
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.model.attachment import InfluenceVector, checked_influence_vector
 from snrmjax.model.effect_metadata import (
     Confounder,
     MotionScales,
@@ -28,45 +28,43 @@ from snrmjax.model.effect_metadata import (
 )
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.nonsmooth_points import NonsmoothPoints, with_nonsmooth_points
-from snrmjax.model.places import Row, checked_row
 from snrmjax.model.potential import PolynomialPotential
 
 Scalar = Float[Array, ""]
 Samples = Float[Array, " time"]
 States = Float[Array, " state"]
-StateAt = Float[Array, ""] | Float[Array, " row"]
-"""What a force acts on: one number, or one for every row of a force at several."""
+StateAt = Float[Array, ""] | Float[Array, " attachment"]
+"""Displacement or velocity at a force: a number, or one for each of several attachments."""
 Starts = list[tuple[float, ...]]
-"""Parameters, in the order of the constructor, from which a fit begins."""
+"""Starting values of a fit: parameters in the order of the constructor."""
 Bounds = list[tuple[float, float]]
-"""Of every parameter the least and the largest value that a fit considers."""
+"""Lower and upper bound of every parameter in a fit."""
 
 
 class AbstractEffect(eqx.Module):
     """One physical effect, defined once: its equation, and what a diagnosis must know about it.
 
     Effects act on the mode of interest alone: on its modal coordinate q, its linear terms, or
-    what is recorded of it. Forces may act at points instead (`AbstractForce`) and then couple
+    its measured response. Forces may act at points instead (`AbstractForce`) and then couple
     modes, as the potential does.
 
     The parameters are the fields without a default, the first of them the effect's strength: at
-    zero the effect does nothing. `parameter` gives a field its unit, rules and prior; a field
-    without it has none. Fields with a default are settings of the computation, which no file
-    holds.
+    zero the effect vanishes. `parameter` gives a field its unit, rules and prior; a field
+    without it has none. Fields with a default are numerical settings and are not written to files.
 
-    Only `kind`, the name in files, must be stated. Beside it a class may state
+    Only `kind`, the name in files, is required. Optional are
 
-    - `description`: what the effect is physically, in one sentence that reports print;
+    - `description`: the physical mechanism, in one sentence for reports;
     - `shape`: which part of the force balance it changes, its symmetry and its power of amplitude;
-      of a force that states none it is computed (see `shape_of`);
-    - `confounders`: other effects that the same data may show, and the measurement that separates
-      them;
-    - `like_force_gain`: a gain of all forces does the same;
-    - `follows_force`: it adds a linear motion that the force drives, which beside a force of any
-      size could be all that one sees;
-    - `only_phase`: amplitudes do not show it;
-    - `searched`: whether a diagnosis looks for it by itself, or only as an alternative to an
-      answer.
+      computed from the force where not given (see `shape_of`);
+    - `confounders`: other effects that could produce the same data, and the measurement that
+      separates them;
+    - `like_force_gain`: equivalent to a gain of all forces;
+    - `follows_force`: it adds a linear response to the force, which could be the whole response
+      if the force gain is unknown;
+    - `only_phase`: it does not change amplitudes;
+    - `searched`: whether a diagnosis tests it as a hypothesis of its own, or only as an
+      alternative to another one.
     """
 
     kind: ClassVar[str]
@@ -89,11 +87,11 @@ class AbstractEffect(eqx.Module):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """Parameters from which a fit to measured states begins, of a strength plainly seen.
+        """Starting values of a fit to measured states, of clearly visible strength.
 
-        One, of the parameters' own `start`, where the strength states one; those of a force whose
-        `shape` has a factor and a power of amplitude follow from these. Empty where nothing is
-        stated: the strength is then found from the force itself.
+        From the parameters' own `start` where the strength has one, otherwise from the factor and
+        the power of amplitude of `shape`. Empty without either: the strength is then computed
+        from the force (see `starts_of`).
         """
         stated = list(cls.parameters().values())
         if stated[0].start is not None:
@@ -101,18 +99,18 @@ class AbstractEffect(eqx.Module):
         shape = cls.shape
         if shape is None or shape.factor is None or shape.power is None:
             return []
-        size = shape.factor * scales.amplitude**shape.power
-        strength = scales.change / (size * scales.frequency**shape.frequency_power)
+        per_strength = shape.factor * scales.amplitude**shape.power
+        strength = scales.change / (per_strength * scales.frequency**shape.frequency_power)
         return [(strength, *(other.typical for other in stated[1:]))]
 
     @classmethod
     def bounds(cls, scales: MotionScales) -> Bounds:
-        """The least and the largest value of every parameter that a fit considers."""
+        """Lower and upper bound of every parameter in a fit."""
         return [parameter.prior.bounds(scales) for parameter in cls.parameters().values()]
 
     @classmethod
     def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
-        """A change of every parameter that is plainly seen, from the sizes of a start."""
+        """A clearly visible change of every parameter, from the magnitudes of a start."""
         return start
 
     @classmethod
@@ -126,7 +124,7 @@ class AbstractEffect(eqx.Module):
         return cls(*jax.device_put([np.asarray(value) for value in values]))
 
     def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
-        """An effect like this one, of the same structure, at zero strength.
+        """An effect with the same array shapes at zero strength.
 
         Arguments: see `without_strength`.
         """
@@ -134,26 +132,28 @@ class AbstractEffect(eqx.Module):
 
 
 class AbstractForce(AbstractEffect):
-    """A force on the mode of interest or at points, known over one cycle of a steady motion.
+    """A force on the mode of interest or at points, defined over one cycle of a steady motion.
 
-    `at` says where: a point, `between("tip", "root")` for their relative motion, or points with
-    weights b; the force then acts on x = Σ b x_point and, by b, on every point. Such a force is the
-    whole element: the linear modes hold no part of it. Without `at` it acts on the mode of
-    interest.
+    `at` is where it acts: a point, `between("tip", "root")` for their relative motion, or points
+    with weights b; the force then acts on x = Σ b x_point and exerts b f on every point. Such a
+    force is the whole element: its stiffness is not part of the linear modes. Without `at` it acts
+    on the mode of interest.
     """
 
-    at: Row | None = eqx.field(default=None, static=True, kw_only=True, converter=checked_row)
+    at: InfluenceVector | None = eqx.field(
+        default=None, static=True, kw_only=True, converter=checked_influence_vector
+    )
 
     @property
-    def rows(self) -> tuple[Row | None, ...]:
-        """The rows on which it acts: one, but for contacts that move along and across a surface.
+    def rows(self) -> tuple[InfluenceVector | None, ...]:
+        """Its influence vectors: one, or two for contacts with tangential and normal motion.
 
         With several, displacements, velocities and forces have a last axis for them.
         """
         return (self.at,)
 
     def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
-        """See `AbstractEffect`; it acts at the same place."""
+        """See `AbstractEffect`; it acts at the same points."""
         idle = super().idle(natural_frequency, damping_ratio)
         return dataclasses.replace(idle, at=self.at)
 
@@ -162,79 +162,80 @@ class AbstractForce(AbstractEffect):
         """The force at equally spaced samples of one period of a steady motion.
 
         Arguments: q in kg^1/2 m and q̇ in kg^1/2 m/s (at points: m, m/s); sample 0 is at phase 0
-        of the force and the end of the period is left out. Returns kg^1/2 m/s² (at points: N), on
-        the left of the equations of motion.
+        of the force and the end point of the period is excluded. Returns kg^1/2 m/s² (at points:
+        N), on the left of the equations of motion.
         """
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """`cycle_force` by a shorter formula, where there is one; NaN where that does not hold.
+        """`cycle_force` by a closed form, where there is one; NaN where that is not valid.
 
-        Of friction it is Masing's rule, which holds for cycles with two turning points.
+        For friction it is Masing's rule, valid for cycles with two turning points.
         """
         return self.cycle_force(displacement, velocity)
 
     @classmethod
     def has_quick_formula(cls) -> bool:
-        """Whether `quick_cycle_force` is another formula than `cycle_force`."""
+        """Whether `quick_cycle_force` differs from `cycle_force`."""
         return cls.quick_cycle_force is not AbstractForce.quick_cycle_force
 
 
 class AbstractMemoryless(AbstractForce):
-    """A force f(q, q̇) that depends on the present state alone."""
+    """A force f(q, q̇) that depends on the instantaneous state alone."""
 
     @abstractmethod
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """The force f(q, q̇) on the left of the modal equation, in kg^1/2 m/s²."""
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """The force at any samples, of one period or not."""
+        """The force at any samples, whether or not they span one period."""
         return jax.vmap(self.force)(displacement, velocity)
 
 
 class AbstractNonsmooth(AbstractMemoryless):
     """A memoryless force whose slope jumps where a contact opens or closes.
 
-    Harmonic balance evaluates a cycle at samples, of which a contact that opens between two of them
-    would make jumps; `cycle_force` therefore finds these times (see `with_nonsmooth_points`). A
-    class whose force is a straight line between such points may say so by `is_straight`.
+    In harmonic balance a contact event between two samples of the cycle makes the Fourier
+    coefficients jump; `cycle_force` therefore locates the events (see `with_nonsmooth_points`).
+    `is_straight` marks a force that is piecewise linear between such points.
     """
 
     is_straight: ClassVar[bool] = False
 
     @abstractmethod
     def nonsmooth_points(self) -> NonsmoothPoints:
-        """Where the slope jumps; elsewhere the force is smooth, and everywhere continuous."""
+        """Where the slope jumps; the force is continuous there and smooth elsewhere."""
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """The force over one period, such that Fourier sums over its samples are integrals."""
+        """The force over one period, corrected so that sums over its samples are integrals."""
         return with_nonsmooth_points(
             super().cycle_force(displacement, velocity), displacement, self.nonsmooth_points()
         )
 
 
 class AbstractHysteresis(AbstractForce):
-    """A force with memory: it has internal states beside q and q̇ in time integration.
+    """A hysteretic force: time integration needs its internal variables in addition to q and q̇.
 
     `cycle_force` is that of the steady cycle, which needs no states. For time integration take
-    the effect that `scaled_for` returns, begin with its `initial_states`, integrate `state_rate`
-    and apply `state_force`.
+    the effect that `scaled_for` returns, start from its `initial_states`, integrate `state_rate`
+    and apply `state_force`. With `held_in_steps` the states are constant within a step of the
+    integrator and are updated by `after_step`.
     """
 
     held_in_steps: ClassVar[bool] = False
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
-        """The same effect, set for integration in time of motions up to these amplitudes.
+        """The same effect, prepared for time integration of motions up to these amplitudes.
 
-        Arguments: the largest |q| in kg^1/2 m and the typical |q̇| in kg^1/2 m/s to come.
+        Arguments: the largest expected |q| in kg^1/2 m and the typical |q̇| in kg^1/2 m/s.
         """
         return self
 
     @abstractmethod
     def initial_states(self) -> States:
-        """The internal states of a structure that has not moved yet."""
+        """The internal states of the undeformed structure."""
 
     def states_at_rest(self, displacement: StateAt) -> States:
-        """The internal states of a structure that was brought to a displacement and held there."""
+        """The internal states after a quasi-static displacement from zero."""
         return self.initial_states()
 
     @abstractmethod
@@ -243,7 +244,7 @@ class AbstractHysteresis(AbstractForce):
 
     @abstractmethod
     def state_rate(self, displacement: StateAt, velocity: StateAt, states: States) -> States:
-        """Rates of the internal states, per second; not asked for with `held_in_steps`."""
+        """Rates of the internal states, per second; not used with `held_in_steps`."""
 
     def after_step(
         self,
@@ -252,15 +253,15 @@ class AbstractHysteresis(AbstractForce):
         end: tuple[StateAt, StateAt],
         time: Array,
     ) -> States:
-        """The internal states after a step of an integrator, from what it makes of them.
+        """The internal states after a step of the integrator, corrected from its own result.
 
         Arguments: displacement and velocity at the `begin` and at the `end` of a step of `time` s.
-        Effects with `held_in_steps`, whose states jump from holding to following, set them here.
+        Effects with `held_in_steps`, whose states switch between stick and slip, update them here.
         """
         return states
 
-    def stuck_stiffness(self) -> Float[Array, " row"]:
-        """The largest stiffness along every row, in 1/s²: what a step of an integrator resolves."""
+    def stuck_stiffness(self) -> Float[Array, " attachment"]:
+        """The largest stiffness at every attachment, in 1/s², which limits the time step."""
         return jnp.zeros(len(self.rows))
 
     @abstractmethod
@@ -277,26 +278,26 @@ class AbstractLinearChange(AbstractEffect):
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """The terms that are added to the mass 1, the damping 2ζω₀ and the stiffness ω₀².
+        """The terms added to the mass 1, the damping 2ζω₀ and the stiffness ω₀².
 
         Arguments: ω₀ in rad/s, ζ, and the test order from 0 to 1. Returns mass (relative to the
-        modal mass), damping (1/s) and stiffness (1/s²). Several changes add up; their products,
-        of second order, are left out.
+        modal mass), damping (1/s) and stiffness (1/s²). Several changes add up; their
+        second-order products are neglected.
         """
 
 
 class AbstractAddedMode(AbstractEffect):
-    """A further mode, coupled to the mode of interest through the potential."""
+    """An additional mode, coupled to the mode of interest through the potential."""
 
     @abstractmethod
     def expanded(
         self, modes: LinearModes, potential: PolynomialPotential
     ) -> tuple[LinearModes, PolynomialPotential]:
-        """The modes and the potential with the further mode as the last one."""
+        """The modes and the potential with the additional mode as the last one."""
 
 
 class AbstractForceSpectrum(AbstractEffect):
-    """Harmonics of the force beside its fundamental."""
+    """Harmonics of the force in addition to its fundamental."""
 
     shape: ClassVar[Shape | None] = Shape(Part.HARMONICS)
 
@@ -306,10 +307,10 @@ class AbstractForceSpectrum(AbstractEffect):
 
 
 class AbstractMeasurementEffect(AbstractEffect):
-    """A difference between the true motion and its record; the motion itself is unchanged.
+    """A difference between the true and the recorded motion; the motion itself is unchanged.
 
-    Several act in the order of their `stage`: what the sensors see of the structure (0 and 1)
-    comes before what the instruments make of it (2).
+    Several act in the order of their `stage`: response at the sensors (0 and 1) before errors of
+    the instruments (2).
     """
 
     shape: ClassVar[Shape | None] = Shape(Part.INSTRUMENTS)
@@ -323,7 +324,7 @@ class AbstractMeasurementEffect(AbstractEffect):
         velocity: Complex[Array, "state harmonic sensor"],
         displacement: Float[Array, " state"],
     ) -> tuple[Float[Array, " state"], Complex[Array, "state harmonic sensor"]]:
-        """Force and velocity as they are recorded.
+        """The recorded force and velocity.
 
         Arguments: Ω in rad/s, the force's amplitude in N, the phasors e^{+ihΩt} of harmonics 0,
         1, … of the velocity in m/s, and the amplitude Q of the mode of interest's fundamental
@@ -332,11 +333,11 @@ class AbstractMeasurementEffect(AbstractEffect):
 
 
 def checked_effects(effects: AbstractEffect | Iterable[AbstractEffect]) -> tuple[Any, ...]:
-    """Effects as a structure holds them: a tuple, their parameters as arrays.
+    """Effects as a structure stores them: a tuple, with their parameters as arrays.
 
-    Parameters that are plain numbers become arrays of 64-bit floats; arrays stay as they are,
-    traced ones too. One effect counts as a tuple of one.
-    Raises `ValueError` for a class in place of an effect, and for what is no effect.
+    Parameters that are plain numbers become arrays of 64-bit floats; arrays are unchanged, traced
+    ones too. A single effect becomes a tuple of one.
+    Raises `ValueError` for a class in place of an instance, and for anything but effects.
     """
     several = isinstance(effects, Iterable) and not isinstance(effects, type)
     given: Any = effects if several else (effects,)

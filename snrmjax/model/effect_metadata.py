@@ -1,4 +1,4 @@
-"""What an effect states about itself beside its equation: parameters, shape, confusions."""
+"""Metadata of an effect in addition to its equation: parameters, shape, confounders."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,11 +12,11 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import Rule
 
 VISIBLE_CHANGE = 0.05
-"""Of the dynamic stiffness near resonance (or of a recorded size): what a first guess changes."""
+"""Change by a starting value, relative to the dynamic stiffness near resonance or an amplitude."""
 
 
 class MotionScales(NamedTuple):
-    """Typical sizes of the measured motions, from which fits take their starting values."""
+    """Typical magnitudes of the measured motions, for starting values and bounds of fits."""
 
     amplitude: float  # median amplitude Q of the mode of interest, kg^1/2 m
     largest: float  # largest Q, kg^1/2 m
@@ -28,14 +28,14 @@ class MotionScales(NamedTuple):
 
     @property
     def change(self) -> float:
-        """A change of the dynamic stiffness that is plainly seen, 1/s²."""
+        """A clearly visible change of the dynamic stiffness, 1/s²."""
         return VISIBLE_CHANGE * self.stiffness
 
 
 class Prior(NamedTuple):
-    """A flat prior: the values of a parameter that a fit considers.
+    """A uniform prior: the bounds of a parameter in a fit.
 
-    With `unit`, a quantity of the measured motions, the bounds are multiples of it.
+    With `unit`, a scale of the measured motions, the bounds are multiples of it.
     """
 
     lower: float = -np.inf
@@ -44,36 +44,36 @@ class Prior(NamedTuple):
 
     def bounds(self, scales: MotionScales) -> tuple[float, float]:
         """The bounds in the parameter's own unit."""
-        size = 1.0 if self.unit is None else self.unit(scales)
-        return self.lower * size, self.upper * size
+        scale = 1.0 if self.unit is None else self.unit(scales)
+        return self.lower * scale, self.upper * scale
 
 
 ANY = Prior()
-NOT_BELOW_ZERO = Prior(lower=0.0)
-MORE_THAN_NOTHING = Prior(lower=-0.99)
-"""Relative changes of what stays positive."""
-FURTHER_DAMPING = Prior(1e-5, 0.2)
-"""Damping ratios that a further mode may have."""
+NON_NEGATIVE = Prior(lower=0.0)
+POSITIVE_FACTOR = Prior(lower=-0.99)
+"""Relative changes of a positive quantity."""
+ADDED_MODE_DAMPING = Prior(1e-5, 0.2)
+"""Damping ratio of an added mode."""
 
 
 class Entries(StrEnum):
-    """Whether a parameter is one number, or one for every knot of a law."""
+    """Whether a parameter is a scalar, or has one entry for every knot of a law."""
 
     ONE = "one"
-    KNOTS = "knots"  # where the knots are, rising: chosen, not fitted
+    KNOTS = "knots"  # ascending positions of the knots: chosen, not fitted
     VALUES = "values"  # at the knots
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """One parameter of an effect: its unit, what it is, and which values it may have.
+    """One parameter of an effect: its unit, meaning and permitted values.
 
-    `rules` are those of files and constructors; `prior` is what a fit considers. `typical` is the
-    value from which a fit begins and which the parameter has while the effect has no strength.
+    `rules` are those of files and constructors; `prior` has the bounds of a fit. `typical` is the
+    default starting value, and the value while the effect has zero strength.
     `exponent` names, for the coefficient c of a law c x^p, the parameter p: the coefficient is
-    that at unit amplitude, and a fit steps in c R^(p − 1), at a typical amplitude R, instead.
-    `entries` says of a law's parameters that they are a number for every knot. `start` gives the
-    one value from which a fit to motions of some sizes begins.
+    that at unit amplitude, and a fit uses c R^(p − 1), at a typical amplitude R, instead.
+    `entries` marks parameters of a law with one number for every knot. `start` gives the starting
+    value of a fit to motions of given magnitudes.
     """
 
     unit: str = ""
@@ -87,9 +87,9 @@ class Parameter:
 
 
 def parameter(unit: str, meaning: str = "", **stated: Any) -> Any:
-    """A field of an effect that is one of its parameters; the arguments are `Parameter`'s.
+    """Declare a field of an effect as one of its parameters; arguments as of `Parameter`.
 
-    The first parameter is the effect's strength: at zero the effect does nothing.
+    The first parameter is the effect's strength: at zero the effect vanishes.
     """
     return eqx.field(metadata={"parameter": Parameter(unit, meaning, **stated)})
 
@@ -106,7 +106,7 @@ class Part(StrEnum):
 
 
 class Symmetry(StrEnum):
-    """Of a force f under reversal of the motion, f(−q, −q̇)."""
+    """Symmetry of a force f under reversal of the motion: f(−q, −q̇)."""
 
     ODD = "odd"  # −f
     EVEN = "even"  # f
@@ -114,7 +114,7 @@ class Symmetry(StrEnum):
 
 
 class Argument(StrEnum):
-    """What a force is a function of, against which it is drawn; others are drawn as loops."""
+    """The variable a force depends on, the abscissa of its plot; others are plotted as loops."""
 
     DISPLACEMENT = "displacement"
     VELOCITY = "velocity"
@@ -125,10 +125,10 @@ class Argument(StrEnum):
 class Shape(NamedTuple):
     """How an effect depends on amplitude, to lowest order in its strength.
 
-    A force with one power changes Δ(ω̃²), or ΩΔ(2ζ̃ω̃) where it damps, both in 1/s², by
-    `factor` · strength · Q^`power` · Ω^`frequency_power`. `power` is None where there is no single
-    one. `strength_order` is the power of the strength with which the fundamental changes: 2 where
-    the effect acts on it through other harmonics only.
+    A force with a single power changes Δ(ω̃²), or ΩΔ(2ζ̃ω̃) if it is dissipative, both in 1/s², by
+    `factor` · strength · Q^`power` · Ω^`frequency_power`. `power` is None if there is no single
+    one. `strength_order` is the order in the strength of the change of the fundamental: 2 if the
+    effect acts on it only through other harmonics.
     """
 
     part: Part
@@ -141,30 +141,31 @@ class Shape(NamedTuple):
 
     @property
     def lowest_harmonic(self) -> int | None:
-        """The lowest harmonic of the velocity, above the fundamental, in which the effect shows."""
+        """The lowest harmonic of the velocity, above the fundamental, that the effect generates."""
         if self.symmetry is None:
             return None
         return 3 if self.symmetry is Symmetry.ODD else 2
 
     @property
     def fact(self) -> Fact:
-        """What the effect changes and where it shows."""
+        """The part the effect changes and its signature."""
         return Fact(
             "shape_of_effect", part=self.part, power=self.power, harmonic=self.lowest_harmonic
         )
 
     @property
     def grows(self) -> bool:
-        """Whether it is a damping that grows with amplitude."""
+        """Whether it is damping that increases with amplitude."""
         return self.part is Part.DAMPING and self.power is not None and self.power > 0
 
 
 class Confounder(NamedTuple):
-    """Effects that measured states may not tell apart, and the measurement that does.
+    """Effects that measured states may not distinguish, and the measurement that does.
 
     The effects are those whose classes name it among their `confounders`. With `by_itself` the
-    measurement is asked for where one of them is in question beside any other effect. With
-    `by_calibration` they do the same to every test of one mode: only a calibration tells them.
+    measurement is proposed where one of them competes with any other effect. With
+    `by_calibration` they are equivalent in every test of one mode: only a calibration separates
+    them.
     """
 
     separated_by: str

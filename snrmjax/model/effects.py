@@ -1,4 +1,4 @@
-"""All effects by their kind: the library's and those that a user registers."""
+"""Registry of effects by kind: those of the library and those registered by users."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from snrmjax.model.attachment import InfluenceVector, influence_vector, unit_at
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.library.damping import CubicDamping, QuadraticDamping, VanDerPolDamping
@@ -57,33 +58,32 @@ from snrmjax.model.library.stiffness import (
     QuinticStiffness,
     StaticPreload,
 )
-from snrmjax.model.places import Row, row_over_points, unit_at
 from snrmjax.numerics.kept_programs import keep_no_programs
 from snrmjax.numerics.rules import require
 from snrmjax.numerics.units import unit_in_print
 
 
 class EffectTable(dict[str, type[AbstractEffect]]):
-    """Effects by their kind. It prints as a table: kind, parameters with units, description."""
+    """Effects by their kind. Prints as a table: kind, parameters with units, description."""
 
     further: Mapping[str, type[AbstractEffect]] = MappingProxyType({})  # printed below its own
 
     def __repr__(self) -> str:
-        """One line for each effect, then for each element that a diagnosis does not look for."""
+        """One line for each effect, then for each element that only acts at points."""
         width = max((len(kind) for kind in (*self, *self.further)), default=0)
 
-        def table(effects: Mapping[str, type[AbstractEffect]], at: Row | None) -> str:
+        def table(effects: Mapping[str, type[AbstractEffect]], at: InfluenceVector | None) -> str:
             lines = (
                 f"{k:{width}}  {_parameters(e, at)}: {_description(e)}" for k, e in effects.items()
             )
             return "\n".join(line.rstrip() for line in lines)
 
-        further = f"\n\nOnly at points, by `at`:\n{table(self.further, row_over_points('x'))}"
+        further = f"\n\nOnly at points, by `at`:\n{table(self.further, influence_vector('x'))}"
         return table(self, None) + (further if self.further else "")
 
 
-def _parameters(effect: type[AbstractEffect], at: Row | None) -> str:
-    """Names of the parameters with their units, where the effect acts."""
+def _parameters(effect: type[AbstractEffect], at: InfluenceVector | None) -> str:
+    """Names of the parameters with their units at the attachment."""
     return ", ".join(
         f"{name} ({unit_in_print(unit_at(at, of.unit)) or 'no unit'})" if of.unit else name
         for name, of in effect.parameters().items()
@@ -127,7 +127,7 @@ EFFECTS: EffectTable = EffectTable(
         StaticPreload,
     )
 )
-"""The effects by the kind that files give them; `print(EFFECTS)` is a table of them."""
+"""The effects by their kind in files; `print(EFFECTS)` is a table of them."""
 
 LAWS: dict[str, type[AbstractLaw]] = {
     law.kind: law
@@ -140,7 +140,7 @@ LAWS: dict[str, type[AbstractLaw]] = {
         SlipLaw,
     )
 }
-"""The laws given by a table of knots, by their kind: drawn where no effect of the library holds."""
+"""Tabulated laws by their kind: identified from data where no effect of the library fits."""
 
 ELEMENTS: dict[str, type[AbstractEffect]] = EffectTable(
     (element.kind, element)
@@ -153,24 +153,23 @@ ELEMENTS: dict[str, type[AbstractEffect]] = EffectTable(
         FrictionContact,
     )
 )
-"""Further forces for points of a structure, by their kind; a diagnosis does not look for them."""
+"""Further nonlinear elements between points, by their kind; not hypotheses of a diagnosis."""
 
 EFFECTS.further = ELEMENTS
 
 SURFACES = (FrictionContact.kind,)
-"""Kinds of elements that act across a surface, `normal_at`, and along it, `at`."""
+"""Kinds of elements with a normal (`normal_at`) and a tangential (`at`) attachment."""
 
 # `help(EFFECTS)` shows the docstring of its class.
 EffectTable.__doc__ = f"{EffectTable.__doc__}\n\n{EFFECTS!r}"
 
 
 def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
-    """Make an effect of your own known to files, simulations, calibrations and diagnoses.
+    """Register an effect of your own for files, simulations, calibrations and diagnoses.
 
     Use as a decorator of a class with a `kind`, parameters as fields and a force, whose
-    derivatives must be finite, at rest too. What the class does not state (see `AbstractEffect`
-    and `parameter`) is computed from its force, and it is treated like an effect of the library
-    wherever and whenever it is registered:
+    derivatives must be finite, at rest too. What the class does not define (see `AbstractEffect`
+    and `parameter`) is computed from its force, and it is treated like an effect of the library:
 
         @sj.model.register_effect
         class RootDamping(sj.model.AbstractMemoryless):
@@ -181,20 +180,20 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
             def force(self, displacement, velocity):
                 return self.coefficient * velocity / (velocity**2 + 1e-12) ** 0.25
 
-    Returns the class. Raises `ValueError` for a kind that exists already and for a class without
+    Returns the class. Raises `ValueError` for an existing kind and for a class without
     parameters.
     """
     if effect.kind in known_effects():
-        raise ValueError(f"there is an effect of the kind {effect.kind!r} already.")
+        raise ValueError(f"an effect of the kind {effect.kind!r} is already registered.")
     if not effect.parameters():
         raise ValueError(f"{effect.kind!r} must have a parameter: a field without a default.")
-    keep_no_programs()  # they would not tell this class from a later one of its name
+    keep_no_programs()  # they would not distinguish this class from a later one of its name
     EFFECTS[effect.kind] = effect
     return effect
 
 
 def effect_class(kind: str) -> type[AbstractEffect]:
-    """The class of a kind of effect, of the library, of a user, an element or a drawn law.
+    """The class of a kind of effect, of an element or of a tabulated law.
 
     Raises `KeyError` for an unknown kind.
     """
@@ -202,7 +201,7 @@ def effect_class(kind: str) -> type[AbstractEffect]:
 
 
 def is_own(kind: str) -> bool:
-    """Whether an effect is one that a user registered."""
+    """Whether an effect was registered by a user."""
     return not effect_class(kind).__module__.startswith("snrmjax.")
 
 
@@ -220,19 +219,19 @@ def make_effect(
     kind: str,
     parameters: Mapping[str, float | Array | np.ndarray],
     *,
-    at: str | Mapping[str, float] | Row | None = None,
-    normal_at: str | Mapping[str, float] | Row | None = None,
+    at: str | Mapping[str, float] | InfluenceVector | None = None,
+    normal_at: str | Mapping[str, float] | InfluenceVector | None = None,
 ) -> AbstractEffect:
     """Build an effect from its kind and its parameters by name.
 
-    `at` is a point, a row such as `between("tip", "root")`, or points with weights: there a force
-    acts, with parameters in N and m; without it on the mode of interest. `normal_at`, likewise, is
-    where a contact that moves across its surface too is pressed.
+    `at` is where a force acts, with parameters in N and m: a point, an influence vector such as
+    `between("tip", "root")`, or points with weights; without it on the mode of interest.
+    `normal_at`, likewise, is the normal direction of a contact.
 
-    Raises `ValueError` for an unknown kind, for an unknown, a missing and a non-finite parameter,
-    for one out of its range (traced parameters are not looked at), and for a law whose tables
-    have not two knots or more, or different numbers of them, or knots that do not rise, and for a
-    place of an effect that is no force.
+    Raises `ValueError` for an unknown kind, for an unknown, missing or non-finite parameter, for
+    one out of its range (traced parameters are not checked), for tables of a law with fewer than
+    two knots, different lengths or knots that do not ascend, and for `at` of an effect that is
+    not a force.
 
     >>> drag = make_effect("quadratic_damping", {"coefficient": 2.0})
     >>> drag.cycle_force(jnp.array([1.0, 0.0]), jnp.array([0.0, -3.0]))
@@ -247,17 +246,17 @@ def make_effect(
         require(f"`{name}` of {kind}", value, *wanted[name].rules)
     arrays = {k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()}
     _check_tables(kind, arrays)
-    places = {"at": at, "normal_at": normal_at}
-    given = {name: row_over_points(row) for name, row in places.items() if row is not None}
+    attachments = {"at": at, "normal_at": normal_at}
+    given = {name: influence_vector(b) for name, b in attachments.items() if b is not None}
     if given and not issubclass(effect_class(kind), AbstractForce):
-        raise ValueError(f"{kind} is no force: it cannot act at a point.")
+        raise ValueError(f"{kind} is not a force: it cannot act at a point.")
     if normal_at is not None and kind not in SURFACES:
-        raise ValueError(f"{kind} acts at one place: it takes no `normal_at`.")
+        raise ValueError(f"{kind} has a single attachment: it takes no `normal_at`.")
     return effect_class(kind)(**arrays, **given)
 
 
 def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:
-    """Refuse tables of a law that are no table, and one number where a table belongs."""
+    """Refuse tables of a law with wrong shapes or knots that do not ascend."""
     shape: tuple[int, ...] = ()
     for name, parameter in effect_class(kind).parameters().items():
         value = arrays[name]
@@ -277,8 +276,8 @@ def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:
         if parameter.entries is Entries.KNOTS and not isinstance(value, jax.core.Tracer):
             steps = np.diff(np.asarray(value))
             if np.any(steps <= 0):
-                place = int(np.argmax(steps <= 0))
+                first = int(np.argmax(steps <= 0))
                 raise ValueError(
                     f"`{name}` of {kind} must rise from knot to knot, but has "
-                    f"{float(value[place + 1]):g} after {float(value[place]):g}."
+                    f"{float(value[first + 1]):g} after {float(value[first]):g}."
                 )

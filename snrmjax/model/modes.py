@@ -1,4 +1,4 @@
-"""Linear modes of a structure and their response to a harmonic force."""
+"""Linear modes of a structure and their frequency response."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -16,23 +16,23 @@ from snrmjax.numerics.result import AbstractShown
 from snrmjax.numerics.rules import BELOW_ONE, NOT_NEGATIVE, POSITIVE, require
 from snrmjax.numerics.units import HERTZ
 
-_SHOWN = 12  # modes, in a text
-STILL = 1e-9  # of the largest shape at a point, below which a mode has a node there
+_SHOWN = 12  # modes listed in a text
+STILL = 1e-9  # of the largest shape at a point, below which a mode counts as having a node there
 
 UNSTATED_MODAL_MASS_STD = 0.05
-"""1σ, relative, of a modal mass of which nobody stated one.
+"""1σ, relative, of a modal mass whose uncertainty is not stated.
 
-An assumption: careful modal tests of one structure agree to some per cent in their modal masses.
+An assumption: careful modal tests of one structure agree to a few per cent in modal mass.
 """
 
 
 class LinearModes(AbstractShown):
-    """Mass-normalised linear modes, seen at some sensors and driven by one force pattern.
+    """Mass-normalised linear modes, measured at some sensors and driven by one force pattern.
 
     `mode_of_interest` counts from zero; files count from one.
     """
 
-    natural_frequency: Float[Array, " mode"]  # rad/s; 0 without a linear spring, as the last
+    natural_frequency: Float[Array, " mode"]  # rad/s; 0 without linear stiffness, these last
     damping_ratio: Float[Array, " mode"]  # fraction of critical
     mode_shape: Float[Array, "sensor mode"]  # kg^-1/2
     participation: Float[Array, " mode"]  # Φᵀb per newton of the recorded force, kg^-1/2
@@ -42,30 +42,30 @@ class LinearModes(AbstractShown):
     damping_ratio_std: Float[Array, " mode"]
     sensors: tuple[str, ...] = eqx.field(static=True)
     mode_of_interest: int = eqx.field(static=True, default=0)
-    # 1σ, relative, of the modal masses 1/(Φ_r Φᵀb); None where nobody stated any.
+    # 1σ, relative, of the modal masses 1/(Φ_r Φᵀb); None if not stated.
     modal_mass_std: Float[Array, " mode"] | None = None
-    # Points that no sensor watches, at which forces may act.
+    # Points without a sensor, at which forces may act.
     points: tuple[str, ...] = eqx.field(static=True, default=())
     point_shape: Float[Array, "point mode"] | None = None  # kg^-1/2
-    # ΦᵀCΦ less the 2ζω of its diagonal, 1/s; None for modal damping.
+    # ΦᵀCΦ minus the 2ζω of its diagonal, 1/s; None for modal damping.
     damping_coupling: Float[Array, "mode mode"] | None = None
-    # Of a force that acts on several points with different phases: the part of Φᵀb that lags by 90°
+    # Part of Φᵀb that lags by 90°, of a force that acts at several points with different phases.
     participation_lag: Float[Array, " mode"] | None = None  # kg^-1/2
-    # Where the acceleration of a base drives it: participations are then −Γ, kg^1/2 per m/s².
+    # Base excitation: participations are then −Γ, kg^1/2 per m/s².
     base: BaseMotion | None = eqx.field(static=True, default=None)
-    # A rotating unbalance U = m r, kg m, drives by U Ω²: a "force" is then a multiple of U.
+    # A rotating unbalance U = m r, kg m, exerts U Ω²: a "force" is then a multiple of U.
     unbalance: Float[Array, ""] | None = None
 
     def has_screen(self) -> bool:
-        """Whether these are the modes of one structure, with values."""
+        """Whether these are concrete modes of a single structure."""
         return have_values(self) and self.natural_frequency.ndim == 1
 
     def summary(self) -> tuple[str, ...]:
         """A line for every mode."""
         rigid = self.rigid_body_participation.shape[0]
-        beside = f" and {rigid} rigid-body mode{'s' if rigid > 1 else ''}" if rigid else ""
+        rigid_text = f" and {rigid} rigid-body mode{'s' if rigid > 1 else ''}" if rigid else ""
         count = f"{self.n_modes} mode{'s' if self.n_modes > 1 else ''}"
-        lines = [f"LinearModes: {count}{beside} at {', '.join(self.sensors)}"]
+        lines = [f"LinearModes: {count}{rigid_text} at {', '.join(self.sensors)}"]
         for k in range(min(self.n_modes, _SHOWN)):
             if not self.natural_frequency[k]:
                 lines.append(f"mode {k + 1}: no linear stiffness, only nonlinear elements")
@@ -91,7 +91,7 @@ class LinearModes(AbstractShown):
         return self.natural_frequency.shape[-1]
 
     def shape_at(self, point: str) -> Float[Array, " mode"]:
-        """The modes' shape at a sensor or another point, kg^-1/2.
+        """The mode shapes at a sensor or another point, kg^-1/2.
 
         Raises `ValueError` for an unknown one.
         """
@@ -104,20 +104,22 @@ class LinearModes(AbstractShown):
         raise ValueError(f"a force acts at {point!r}, where the modes have no shape{near}.")
 
     def forced_at(self, point: str) -> "LinearModes":
-        """The same modes moved by a force of one newton at a point instead.
+        """The same modes driven by a force at this point instead.
 
-        Raises `ValueError` for a point without a shape, for one that a rigid-body mode moves but
-        no sensor watches, and for one where the mode of interest stands still.
+        Raises `ValueError` for a point without a shape, for one without a sensor if there are
+        rigid-body modes, and for a node of the mode of interest.
         """
         participation = self.shape_at(point)
         if self.base is not None:
-            raise ValueError("a base drives the structure: its modes say nothing of newtons.")
+            raise ValueError(
+                "the structure is driven by its base: its modes have no scale in newtons."
+            )
         if not np.abs(participation[self.mode_of_interest]) > STILL * np.max(np.abs(participation)):
-            raise ValueError(f"a force at {point!r} does not move the mode of interest.")
+            raise ValueError(f"a force at {point!r} does not excite the mode of interest.")
         rigid = self.rigid_body_participation
         if rigid.size and point not in self.sensors:
             raise ValueError(
-                f"a force at {point!r} moves rigid-body modes, which no sensor there sees."
+                f"a force at {point!r} excites rigid-body modes, but has no sensor there."
             )
         if rigid.size:
             rigid = self.rigid_body_shape[self.sensors.index(point)]
@@ -129,7 +131,7 @@ class LinearModes(AbstractShown):
         )
 
     def with_first_sensor(self, sensor: str) -> "LinearModes":
-        """The same modes with this sensor before the others: responses are told of the first.
+        """The same modes with this sensor first: responses are reported at the first sensor.
 
         Raises `ValueError` for an unknown one.
         """
@@ -147,43 +149,43 @@ class LinearModes(AbstractShown):
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives the structure: a force, a base's acceleration, or an unbalance."""
+        """Unit of the excitation: a force, a base acceleration, or an unbalance."""
         return drive_unit(self.base, self.unbalance)
 
     def driven(self) -> Bool[np.ndarray, " mode"]:
-        """Which flexible modes the force moves by itself, not by rounding alone."""
+        """Which flexible modes the force excites beyond rounding errors."""
         drive = np.abs(np.asarray(phasor_of_load(self)))
         return drive > STILL * np.max(drive, initial=0.0)
 
     @property
     def own_modal_mass_std(self) -> Float[Array, ""] | None:
-        """1σ, relative, of the modal mass of the mode of interest; None where nobody stated it."""
+        """1σ, relative, of the modal mass of the mode of interest; None if not stated."""
         stated = self.modal_mass_std
         return None if stated is None else stated[..., self.mode_of_interest]
 
     @property
     def residual_modes(self) -> tuple[int, ...]:
-        """Indices of the flexible modes other than the mode of interest, which respond linearly."""
+        """Indices of the flexible modes other than the mode of interest; they respond linearly."""
         return tuple(k for k in range(self.n_modes) if k != self.mode_of_interest)
 
 
 def have_values(tree: object) -> bool:
-    """Whether all leaves are arrays with values, as they are outside `jax.jit`."""
+    """Whether all leaves are concrete arrays, as outside `jax.jit`."""
     leaves = jax.tree.leaves(tree)
     kinds = (np.ndarray, jax.Array)
     return all(isinstance(a, kinds) and not isinstance(a, jax.core.Tracer) for a in leaves)
 
 
-class Beside(NamedTuple):
-    """What linear modes may have beside frequencies, damping ratios, shapes and participations."""
+class OptionalModalData(NamedTuple):
+    """Optional data of linear modes: points without a sensor, damping coupling, excitation."""
 
-    # Shapes at points that no sensor watches, kg^-1/2.
+    # Shapes at points without a sensor, kg^-1/2.
     points: dict[str, Shaped[np.ndarray | Array, " mode"] | list[float]] | None = None
-    # Damping beside that of the damping ratios: ΦᵀCΦ less the 2ζω of its diagonal, 1/s.
+    # Damping in addition to the damping ratios: ΦᵀCΦ minus the 2ζω of its diagonal, 1/s.
     damping_coupling: Shaped[np.ndarray | Array, "mode mode"] | None = None
     participation_lag: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None  # kg^-1/2
-    base: BaseMotion | None = None  # whose acceleration stands in the place of the force
-    unbalance: float | Float[Array, ""] | None = None  # kg m, in the place of the force
+    base: BaseMotion | None = None  # whose acceleration replaces the force
+    unbalance: float | Float[Array, ""] | None = None  # kg m, replaces the force
 
 
 class RigidBodyModes(NamedTuple):
@@ -195,11 +197,11 @@ class RigidBodyModes(NamedTuple):
 
 
 class LinearModesStd(NamedTuple):
-    """1σ of what a linear test found; None where it is known exactly."""
+    """1σ of the results of a linear modal test; None if known exactly."""
 
     natural_frequency: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None  # rad/s
     damping_ratio: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None
-    # Relative; None where nobody stated it (`UNSTATED_MODAL_MASS_STD`).
+    # Relative; None if not stated (`UNSTATED_MODAL_MASS_STD`).
     modal_mass: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None
 
 
@@ -213,18 +215,18 @@ def linear_modes(
     mode_of_interest: int = 0,
     rigid_body: RigidBodyModes | None = None,
     std: LinearModesStd | None = None,
-    beside: Beside | None = None,
+    beside: OptionalModalData | None = None,
 ) -> LinearModes:
     """Build `LinearModes` from arrays or lists, checking shapes and ranges.
 
     Arguments: natural frequencies in rad/s, damping as a fraction of critical, shapes at the
     sensors and participations Φᵀb in kg^-1/2; `rigid_body` modes likewise; `std` has the 1σ of
-    frequencies and damping ratios, without which they are known exactly, and of modal masses
-    (relative), without which they are as `UNSTATED_MODAL_MASS_STD` says; `beside` has shapes at
-    points without a sensor, damping that couples the modes, the part of a force that lags, and
-    the base that moves in place of a force.
-    Raises `ValueError` that names the argument whose shape or value is wrong. Numbers that are
-    traced (within `jax.jit` and derivatives) are taken as they are.
+    frequencies and damping ratios (exact without) and of modal masses (relative,
+    `UNSTATED_MODAL_MASS_STD` without); `beside` has optional data: shapes at points without a
+    sensor, damping that couples the modes, the lagging part of a force, and a base or an
+    unbalance in place of the force.
+    Raises `ValueError` that names the argument whose shape or value is wrong. Traced numbers
+    (within `jax.jit` and derivatives) are not checked.
 
     >>> modes = linear_modes([500.0], [0.01], [[2.0]], [3.0])
     >>> modes.n_modes, modes.sensors
@@ -275,34 +277,34 @@ def linear_modes(
             numbers[f"{name}_std"] = _vector(f"std.{name}", values, n_modes)
         elif name != "modal_mass":
             numbers[f"{name}_std"] = np.zeros(n_modes)
-    further = beside or Beside()
-    points = further.points or {}
+    optional = beside or OptionalModalData()
+    points = optional.points or {}
     for name in points:
         if name in names:
             raise ValueError(f"`beside.points` has {name!r}, which is a sensor.")
     if points:
-        rows = [_vector(f"beside.points[{k!r}]", row, n_modes) for k, row in points.items()]
-        numbers["point_shape"] = _numbers(rows)
-    if further.damping_coupling is not None:
-        numbers["damping_coupling"] = _coupling(further.damping_coupling, n_modes)
-    if further.participation_lag is not None:
-        lag = _vector("beside.participation_lag", further.participation_lag, n_modes)
+        shapes_there = [_vector(f"beside.points[{k!r}]", s, n_modes) for k, s in points.items()]
+        numbers["point_shape"] = _numbers(shapes_there)
+    if optional.damping_coupling is not None:
+        numbers["damping_coupling"] = _coupling(optional.damping_coupling, n_modes)
+    if optional.participation_lag is not None:
+        lag = _vector("beside.participation_lag", optional.participation_lag, n_modes)
         numbers["participation_lag"] = lag
-    if further.base is not None:
-        _check_base(further.base, (*names, *points), participations)
-    if further.unbalance is not None:
-        require("`beside.unbalance`", further.unbalance, POSITIVE)
-        numbers["unbalance"] = _numbers(further.unbalance)
-    if further.base is not None and further.unbalance is not None:
+    if optional.base is not None:
+        _check_base(optional.base, (*names, *points), participations)
+    if optional.unbalance is not None:
+        require("`beside.unbalance`", optional.unbalance, POSITIVE)
+        numbers["unbalance"] = _numbers(optional.unbalance)
+    if optional.base is not None and optional.unbalance is not None:
         raise ValueError("a base and an unbalance cannot both drive a structure.")
     modes = LinearModes(
         **numbers,
         sensors=tuple(names),
         mode_of_interest=mode_of_interest,
         points=tuple(points),
-        base=further.base,
+        base=optional.base,
     )
-    # All at once: one by one they compile, a copy of every shape.
+    # In one transfer: one by one, a copy is compiled for every shape.
     return jax.device_put(modes, may_alias=False)
 
 
@@ -310,19 +312,19 @@ def _check_base(base: BaseMotion, points: tuple[str, ...], rigid: Any) -> None:
     for point, _ in base.along:
         if point not in points:
             near = suggestion(point, points) or f"; known are {', '.join(points[:_SHOWN])}"
-            raise ValueError(f"the base's `along` names {point!r}, which is no point{near}.")
+            raise ValueError(f"the base's `along` names {point!r}, which is not a point{near}.")
     if np.size(rigid):
-        raise ValueError("a structure on a base has no rigid-body modes, but some are given.")
+        raise ValueError("with base excitation there are no rigid-body modes, but some are given.")
 
 
 def _numbers(value: Any) -> Any:
-    """An array of the host, or a traced one."""
+    """A NumPy array, or a traced array."""
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
     return jnp.asarray(value, jnp.float64) if traced else np.asarray(value, dtype=np.float64)
 
 
 def _coupling(damping: Any, n_modes: int) -> Any:
-    """The matrix, checked."""
+    """The checked damping coupling matrix."""
     matrix = _numbers(damping)
     require("`beside.damping_coupling`", matrix)
     if matrix.shape != (n_modes, n_modes):
@@ -348,15 +350,15 @@ def residual_velocity(
     frequency: Float[Array, "*batch"],
     force: Float[Array, "*batch"],
 ) -> Complex[Array, "*batch sensor"]:
-    """Velocity of the linear modes other than the mode of interest and of rigid-body modes.
+    """Velocity of rigid-body modes and of all linear modes but the mode of interest.
 
     V_lin + V_RB of Eq. (10b), as phasors e^{+iΩt} relative to the force: a flexible mode gives
-    iΩ Φ ΦᵀF / (ω² − Ω² + 2iζωΩ), a rigid-body mode −iΦ ΦᵀF / Ω. Of a force with phases ΦᵀF is
-    complex; modes that damping couples respond together, with the mode of interest at rest
-    (`identify.pointwise.snrm.sensed_mode` has what its own motion adds).
+    iΩ Φ ΦᵀF / (ω² − Ω² + 2iζωΩ), a rigid-body mode −iΦ ΦᵀF / Ω. For a force with phases ΦᵀF is
+    complex; modes coupled by damping are solved together with the mode of interest fixed
+    (the contribution of its motion is in `identify.pointwise.snrm.sensed_mode`).
 
     Arguments: `frequency` Ω in rad/s, `force` in N. Returns m/s at every sensor.
-    Reference: Kwarta & Allen, Eqs. (10b), (23), turned by +90° (the paper forces with a sine).
+    Reference: Kwarta & Allen, Eqs. (10b), (23), rotated by +90° (the paper uses a sine force).
     """
     keep = np.asarray(modes.residual_modes, dtype=int)
     flexible = _flexible_velocity(modes, keep, frequency, force)
@@ -373,7 +375,7 @@ def linear_response(
 
     Arguments: `frequency` Ω in rad/s, `force` in N. Returns phasors e^{+iΩt} relative to the
     force, in m/s; exact for a linear structure with modal damping. Differentiable.
-    Reference: Kwarta & Allen, Eq. (23), turned by +90° (the paper forces with a sine).
+    Reference: Kwarta & Allen, Eq. (23), with phases rotated by +90° (the paper uses a sine force).
 
     >>> modes = linear_modes([500.0], [0.01], [[2.0]], [3.0])
     >>> linear_response(modes, jnp.array(500.0), jnp.array(1.0)).real.round(6)
@@ -391,14 +393,14 @@ def phasor_of_load(modes: LinearModes) -> Complex[Array, " mode"]:
 
 
 def reference_sensor(modes: LinearModes) -> int:
-    """The sensor at which the mode of interest moves most: amplitudes are given there.
+    """The sensor with the largest shape of the mode of interest, where amplitudes are given.
 
-    Within `jax.jit` mode shapes of several sensors must be known while compiling (not arguments).
+    Within `jax.jit` mode shapes of several sensors must be compile-time constants.
     """
     if modes.mode_shape.shape[0] == 1:
         return 0
     shape = modes.mode_shape
-    if isinstance(shape, jax.core.Tracer):  # of a derivative: it still has its value
+    if isinstance(shape, jax.core.Tracer):  # within a derivative the value is still known
         shape = jax.lax.stop_gradient(shape)
     return int(np.argmax(np.abs(np.asarray(shape)[:, modes.mode_of_interest])))
 
@@ -409,7 +411,7 @@ def _flexible_velocity(
     frequency: Float[Array, "*batch"],
     force: Float[Array, "*batch"],
 ) -> Complex[Array, "*batch sensor"]:
-    """Of some flexible modes, while the others stand still."""
+    """Velocity of some flexible modes, with the others fixed."""
     omega = jnp.asarray(frequency)[..., None]
     load = modes.participation[keep]
     if modes.participation_lag is not None:

@@ -1,4 +1,4 @@
-"""Kinks of a force over a cycle: when they are passed, and what they do to sums over samples."""
+"""Nonsmooth points of a force over a cycle: crossing times, and corrections of sampled sums."""
 
 from typing import NamedTuple
 
@@ -13,38 +13,38 @@ Samples = Float[Array, " time"]
 class NonsmoothPoints(NamedTuple):
     """Displacements at which the slope of a force jumps, and by how much from below to above."""
 
-    displacement: Float[Array, " kink"]
-    slope: Float[Array, " kink"]
+    displacement: Float[Array, " point"]
+    slope: Float[Array, " point"]
 
 
 class Crossings(NamedTuple):
-    """Where a periodic motion passes a displacement: the first times of a period."""
+    """Crossings of a displacement by a periodic motion, in a table of fixed length."""
 
-    passes: Bool[Array, " crossing"]  # false of entries without use
+    valid: Bool[Array, " crossing"]  # false for unused entries
     interval: Int[Array, " crossing"]  # the sample before
     fraction: Float[Array, " crossing"]  # of the interval between two samples
-    rate: Float[Array, " crossing"]  # derivatives there, over samples
+    rate: Float[Array, " crossing"]  # derivatives extremum, per sample
     curvature: Float[Array, " crossing"]
 
 
-_MOST = 16  # passings of one displacement in a period
+_MAX_CROSSINGS = 16  # of one displacement in a period
 
 
-def crossings(displacement: Samples, place: Float[Array, ""]) -> Crossings:
-    """Passings of a displacement, by a cubic through the four samples around each interval.
+def crossings(displacement: Samples, threshold: Float[Array, ""]) -> Crossings:
+    """Crossings of a threshold, by a cubic through the four samples around each interval.
 
-    There may be two within one interval, where a contact just closes; no more than 16 in a period.
+    At most two per interval, where a contact just closes, and 16 per period.
     """
     n = displacement.shape[0]
-    passes, fractions = _passings(jax.lax.stop_gradient(displacement - place))
-    (slot,) = jnp.nonzero(passes.reshape(-1), size=_MOST, fill_value=0)
+    valid, fractions = _sign_changes(jax.lax.stop_gradient(displacement - threshold))
+    (slot,) = jnp.nonzero(valid.reshape(-1), size=_MAX_CROSSINGS, fill_value=0)
     interval, fraction = slot // 2, fractions.reshape(-1)[slot]
-    known = jnp.arange(_MOST) < jnp.sum(passes)
-    around = displacement[(interval + np.arange(-1, 3)[:, None]) % n] - place
+    known = jnp.arange(_MAX_CROSSINGS) < jnp.sum(valid)
+    around = displacement[(interval + np.arange(-1, 3)[:, None]) % n] - threshold
     first, c1, c2, c3 = _cubic(around)
     slope = jax.lax.stop_gradient(c1 + fraction * (2 * c2 + fraction * 3 * c3))
     good = known & (slope != 0)
-    # Each further step of Newton's method with this slope carries one more order of derivatives.
+    # Each Newton step with this frozen slope makes one more order of derivatives exact.
     for _ in range(2):
         value = first + fraction * (c1 + fraction * (c2 + fraction * c3))
         fraction = fraction - jnp.where(good, value / jnp.where(good, slope, 1.0), 0.0)
@@ -52,26 +52,36 @@ def crossings(displacement: Samples, place: Float[Array, ""]) -> Crossings:
     return Crossings(known, interval, fraction, rate, 2 * c2 + 6 * fraction * c3)
 
 
-def _passings(x: Samples) -> tuple[Bool[Array, "time 2"], Float[Array, "time 2"]]:
-    """Where x vanishes within every interval, up to twice, and at which shares of it."""
+def _sign_changes(x: Samples) -> tuple[Bool[Array, "time 2"], Float[Array, "time 2"]]:
+    """Zeros of x within every interval, up to two, as fractions of it."""
     first, c1, c2, c3 = _cubic(jnp.stack([jnp.roll(x, -k) for k in (-1, 0, 1, 2)]))
     second = jnp.roll(x, -1)
     once = (first < 0) != (second < 0)
-    # A turn between two samples of one sign that reaches beyond.
+    # A turning point between two samples of one sign may cross zero: then extremum are two zeros.
     turn = jnp.where(c2 != 0, -0.5 * c1 / jnp.where(c2 != 0, c2, 1.0), -1.0)
     for _ in range(2):
-        bend = 2 * c2 + 6 * turn * c3
+        curvature = 2 * c2 + 6 * turn * c3
         turn = turn - jnp.where(
-            bend != 0, (c1 + turn * (2 * c2 + turn * 3 * c3)) / jnp.where(bend != 0, bend, 1.0), 0.0
+            curvature != 0,
+            (c1 + turn * (2 * c2 + turn * 3 * c3)) / jnp.where(curvature != 0, curvature, 1.0),
+            0.0,
         )
-    there, bend = first + turn * (c1 + turn * (c2 + turn * c3)), 2 * c2 + 6 * turn * c3
-    twice = ~once & (turn > 0) & (turn < 1) & ((there < 0) != (first < 0)) & (bend * there < 0)
-    aside = jnp.sqrt(jnp.where(twice, -2 * there / jnp.where(twice, bend, 1.0), 0.0))
-    # By the parabola through both ends with the slope at the first, of which one root is between.
+    extremum, curvature = first + turn * (c1 + turn * (c2 + turn * c3)), 2 * c2 + 6 * turn * c3
+    twice = (
+        ~once
+        & (turn > 0)
+        & (turn < 1)
+        & ((extremum < 0) != (first < 0))
+        & (curvature * extremum < 0)
+    )
+    half_distance = jnp.sqrt(
+        jnp.where(twice, -2 * extremum / jnp.where(twice, curvature, 1.0), 0.0)
+    )
+    # The parabola through both ends with the slope at the first has one root in between.
     root = jnp.sqrt(jnp.maximum(c1**2 - 4 * (second - first - c1) * first, 0.0))
     below = jnp.where(once, -c1 - jnp.sign(second - first) * root, 1.0)
     single = 2 * first / jnp.where(below != 0, below, 1.0)
-    fraction = jnp.stack([jnp.where(once, single, turn - aside), turn + aside])
+    fraction = jnp.stack([jnp.where(once, single, turn - half_distance), turn + half_distance])
     for _ in range(3):
         rate = c1 + fraction * (2 * c2 + fraction * 3 * c3)
         value = first + fraction * (c1 + fraction * (c2 + fraction * c3))
@@ -81,35 +91,35 @@ def _passings(x: Samples) -> tuple[Bool[Array, "time 2"], Float[Array, "time 2"]
 
 
 def _cubic(x: Float[Array, "4 crossing"]) -> tuple[Array, Array, Array, Array]:
-    """The cubic through four samples, by powers of the share of the middle interval."""
-    before, first, second, behind = x
-    linear = second - first / 2 - before / 3 - behind / 6
+    """Coefficients of the cubic through four samples, in fractions of the middle interval."""
+    before, first, second, after = x
+    linear = second - first / 2 - before / 3 - after / 6
     square = 0.5 * (before + second) - first
-    return first, linear, square, (behind - before) / 6 + 0.5 * (first - second)
+    return first, linear, square, (after - before) / 6 + 0.5 * (first - second)
 
 
 def with_nonsmooth_points(
     force: Samples, displacement: Samples, nonsmooth_points: NonsmoothPoints
 ) -> Samples:
-    """Samples of a force over a period, changed so that sums over them are integrals.
+    """Samples of a force over a period, corrected so that sums over them are integrals.
 
-    The trapezoidal rule errs at a kink between two samples, at θ of their interval, by
-    −J₁B₂(θ)/2 + J₂B₃(θ)/6 (Euler and Maclaurin, with Bernoulli's polynomials and the jumps of the
-    first and second derivative over samples). What makes up for it, for every smooth weight, is
-    added to the two samples: sums then err with the fourth power of the interval and do not jump
-    when a kink goes from one interval to the next.
+    The error of the trapezoidal rule for a corner at the fraction θ of an interval is
+    −J₁B₂(θ)/2 + J₂B₃(θ)/6 (Euler–Maclaurin, with Bernoulli polynomials and the jumps of the
+    first and second derivative per sample). Its correction, for every smooth weight, is added to
+    the two samples: the error is then of fourth order in the interval, and sums do not jump when a
+    corner moves from one interval to the next.
     Reference: Abramowitz & Stegun, Handbook of Mathematical Functions (1964), 23.1.30.
     """
     n = force.shape[0]
-    for place, slope in zip(nonsmooth_points.displacement, nonsmooth_points.slope, strict=True):
-        passes, interval, theta, rate, curvature = crossings(displacement, place)
-        first_jump = jnp.where(passes, slope * jnp.abs(rate), 0.0)
-        second_jump = jnp.where(passes, slope * jnp.sign(rate) * curvature, 0.0)
+    for threshold, slope in zip(nonsmooth_points.displacement, nonsmooth_points.slope, strict=True):
+        valid, interval, theta, rate, curvature = crossings(displacement, threshold)
+        first_jump = jnp.where(valid, slope * jnp.abs(rate), 0.0)
+        second_jump = jnp.where(valid, slope * jnp.sign(rate) * curvature, 0.0)
         square = theta * (theta - 1) + 1 / 6
         cube = theta * (theta - 0.5) * (theta - 1)
         whole = first_jump * square / 2 - second_jump * cube / 6
         later = theta * whole - first_jump * cube / 3
-        # A product is faster than writing to entries, of which derivatives make loops.
+        # A matrix product is faster than scattered writes, whose derivatives become loops.
         samples = (interval[:, None] + np.arange(2)) % n
         spread = (samples[..., None] == np.arange(n)).astype(force.dtype)
         force = force + jnp.stack([whole - later, later], 1).reshape(-1) @ spread.reshape(-1, n)

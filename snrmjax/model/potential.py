@@ -18,7 +18,7 @@ class PolynomialPotential(eqx.Module):
     """V(q) = Σ c_k Π q_i over the modes i of monomial k; the restoring force is f_m = ∂V/∂q_m.
 
     A monomial is the sorted tuple of its modes, counted from zero: (0, 0, 1) is q₁²q₂.
-    The linear stiffness is not in it: that is the linear modes' own.
+    The linear stiffness belongs to the linear modes and is not included.
     """
 
     coefficient: Float[Array, " monomial"]
@@ -34,7 +34,7 @@ class PolynomialPotential(eqx.Module):
     def energy(
         self, displacement: Float[Array | np.ndarray, "*batch mode"]
     ) -> Float[Array, "*batch"]:
-        """Potential energy in J, without the linear stiffness's."""
+        """Potential energy in J, without that of the linear stiffness."""
         return _products(displacement, self.monomials) @ self.coefficient
 
     def force(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch mode"]:
@@ -53,7 +53,7 @@ class PolynomialPotential(eqx.Module):
     def force_of_rows(
         self, displacement: Float[Array, "mode sample"]
     ) -> Float[Array, "mode sample"]:
-        """As `force`, with the samples along the last axis, where long loops are fast."""
+        """As `force`, with the samples along the last axis, which vectorises better."""
         basis, coefficients = self._gradient
         return coefficients.T @ _products(displacement, basis, by_rows=True)
 
@@ -68,15 +68,15 @@ class PolynomialPotential(eqx.Module):
     @property
     def _gradient(self) -> tuple[tuple[Monomial, ...], Float[Array, "monomial mode"]]:
         basis, *given = _derivative_map(self.monomials, self.n_modes)
-        return basis, self._taken(*given)
+        return basis, self._derived(*given)
 
     @property
     def _hessian(self) -> tuple[tuple[Monomial, ...], Float[Array, "monomial pair"]]:
         basis, *given = _second_derivative_map(self.monomials, self.n_modes)
-        return basis, self._taken(*given)
+        return basis, self._derived(*given)
 
-    def _taken(self, monomial: np.ndarray, factor: np.ndarray) -> Float[Array, "monomial column"]:
-        """The coefficients of a derivative: each is one of the potential's times a factor."""
+    def _derived(self, monomial: np.ndarray, factor: np.ndarray) -> Float[Array, "monomial column"]:
+        """Coefficients of a derivative: each is a coefficient of the potential times a factor."""
         xp = np if isinstance(self.coefficient, np.ndarray) else jnp
         return xp.append(self.coefficient, 0.0)[monomial] * factor
 
@@ -92,8 +92,8 @@ def polynomial_potential(
     Arguments: `coefficients` maps a monomial to its coefficient; a monomial is either a text of
     mode numbers counted from one ("1112" is q₁³q₂; with modes above 9, "1-1-12") or a tuple of
     indices counted from zero. `coefficient_std` gives 1σ for some of them.
-    Raises `ValueError` for a monomial of degree below 2, of modes that do not exist, or given
-    twice in two orders, and for a coefficient that is not finite.
+    Raises `ValueError` for a monomial of degree below 2, with unknown modes, or repeated in
+    another order, and for a coefficient that is not finite.
 
     >>> duffing = polynomial_potential({"1111": 0.25}, 1)
     >>> duffing.force(jnp.array([2.0]))
@@ -146,7 +146,7 @@ def parse_monomial(key: str | Monomial, n_modes: int) -> Monomial:
 
 
 def monomial_key(monomial: Monomial) -> str:
-    """A monomial as files write it: mode numbers counted from one, "112" or "1-1-12"."""
+    """A monomial as written in files: mode numbers counted from one, "112" or "1-1-12"."""
     numbers = [str(index + 1) for index in monomial]
     return "".join(numbers) if all(len(n) == 1 for n in numbers) else "-".join(numbers)
 
@@ -157,15 +157,15 @@ def _products(
     *,
     by_rows: bool = False,
 ) -> Float[Array, "..."]:
-    """Π q_i for every monomial, in place of the axis of the modes: the last, or the first."""
+    """Π q_i of every monomial along the axis of the modes, the last or the first."""
     axis, before = (0, ()) if by_rows else (-1, (...,))
     if not monomials:
         shape = list(displacement.shape)
         shape[axis] = 0
         return jnp.zeros(shape, dtype=displacement.dtype)
-    # Factors that are missing are a padding one (index n).
+    # Monomials of lower degree are filled up with a padded factor of one (index n).
     index = _factors(monomials, displacement.shape[axis])
-    # NumPy's own arrays stay NumPy's: nothing is compiled then.
+    # NumPy arrays stay in NumPy, so that nothing is compiled.
     xp = np if isinstance(displacement, np.ndarray) else jnp
     ones = xp.ones_like(displacement[(*before, slice(0, 1))])
     padded = xp.concatenate([displacement, ones], axis=axis)
@@ -176,7 +176,7 @@ def _products(
 
 
 def _factors(monomials: tuple[Monomial, ...], n_modes: int) -> np.ndarray:
-    """The modes of every monomial in a row, filled up with the index of a one after them."""
+    """The modes of every monomial as a row, filled up with the index of the padded one."""
     index = np.full((len(monomials), max(1, max(len(m) for m in monomials))), n_modes)
     for row, monomial in enumerate(monomials):
         index[row, : len(monomial)] = monomial
@@ -188,7 +188,7 @@ Derivative = tuple[tuple[Monomial, ...], np.ndarray, np.ndarray]
 
 @lru_cache(maxsize=256)
 def _derivative_map(monomials: tuple[Monomial, ...], n_modes: int) -> Derivative:
-    """Monomials of the gradient; of which of the potential's, times what, each coefficient is."""
+    """Monomials of the gradient, and for each coefficient its index in the potential and factor."""
     entries: list[tuple[int, Monomial, int, float]] = []
     for k, monomial in enumerate(monomials):
         for mode in sorted(set(monomial)):
@@ -200,7 +200,7 @@ def _derivative_map(monomials: tuple[Monomial, ...], n_modes: int) -> Derivative
 
 @lru_cache(maxsize=256)
 def _second_derivative_map(monomials: tuple[Monomial, ...], n_modes: int) -> Derivative:
-    """As `_derivative_map`, of the Hessian."""
+    """As `_derivative_map`, for the Hessian."""
     entries: list[tuple[int, Monomial, int, float]] = []
     for k, monomial in enumerate(monomials):
         for i, j in itertools.product(sorted(set(monomial)), repeat=2):
@@ -219,7 +219,7 @@ def _assemble(
 ) -> Derivative:
     basis = tuple(sorted({rest for _, rest, _, _ in entries}, key=lambda m: (len(m), m)))
     where = {rest: row for row, rest in enumerate(basis)}
-    # A coefficient that is nothing is taken from behind the last monomial.
+    # A zero coefficient is taken from behind the last monomial.
     monomial = np.full((len(basis), n_columns), n_monomials)
     factors = np.zeros((len(basis), n_columns))
     for k, rest, column, factor in entries:

@@ -1,4 +1,4 @@
-"""Many problems of one shape at once: stacked, in blocks of one size, over the cores."""
+"""Batches of problems of one shape: stacked, split into equal blocks, spread over the cores."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -16,11 +16,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 R = TypeVar("R")
 
-_ROW, _MEMBERS = 16, (1, 4, 64)  # rows of one member, and of how many members, in one program
+_ROW, _MEMBERS = 16, (1, 4, 64)  # rows a member, and numbers of members, of one program
 
 
 def padded(rows: np.ndarray, at_least: int = 128) -> np.ndarray:
-    """Rows with copies of the last up to a power of two of them, so that few shapes compile."""
+    """Rows padded to a power of two with copies of the last, so that few shapes compile."""
     missing = max(at_least, 1 << (len(rows) - 1).bit_length()) - len(rows)
     return np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
 
@@ -28,7 +28,7 @@ def padded(rows: np.ndarray, at_least: int = 128) -> np.ndarray:
 def by_blocks(
     function: Callable[..., tuple], size: int, *rows: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """A compiled function of rows, called with blocks of `size` rows, the last one filled up."""
+    """A compiled function of rows, evaluated in blocks of `size` rows, the last one padded."""
     n = len(rows[0])
 
     def answered(begin: int) -> list[np.ndarray]:
@@ -49,37 +49,37 @@ def by_member(
     owner: Int[np.ndarray, " row"],
     *rows: Shaped[np.ndarray, "row ..."],
 ) -> Shaped[np.ndarray, "row ..."]:
-    """A compiled function of members and rows of each, for every row with the member it is of.
+    """A compiled function of members and their rows, evaluated for every row with its member.
 
-    Arguments: `function` of stacked members and of rows of every one, of shape (member, row, …),
-    gives an array so; `owner` says of which of the `members` a row is. Rows are grouped by member,
-    a few of one and some members a call: those of one member and those of thousands need three
-    programs, whose digits do not depend on other members. Returns shape (row, …).
+    Arguments: `function` maps stacked members and their rows, of shape (member, row, …), to an
+    array of that shape; `owner` is the index of each row's member. Rows are grouped by member and
+    evaluated in calls of a few shapes: one member or thousands compile three programs, and
+    results do not depend on which members share a call. Returns shape (row, …).
     """
     groups = [np.flatnonzero(owner == o) for o in np.unique(owner)]
     parts = [
-        np.resize(part, _ROW)  # filled up with its own
+        np.resize(part, _ROW)  # padded with its own rows
         for group in groups
         for part in np.split(group, range(_ROW, len(group), _ROW))
     ]
-    # By the members, not their rows: a curve of another length is no other program.
+    # Chosen by the number of members alone: a curve of another length does not recompile.
     size = max(size for size in _MEMBERS if size <= len(groups))
 
     def block(begin: int) -> tuple[np.ndarray, np.ndarray]:
         index = np.stack(parts[begin : begin + size])
         index = index[np.minimum(np.arange(size), len(index) - 1)]
-        found = function(taken(members, owner[index[:, 0]]), *(row[index] for row in rows))
-        return index.ravel(), np.asarray(found).reshape(index.size, *found.shape[2:])
+        values = function(taken(members, owner[index[:, 0]]), *(row[index] for row in rows))
+        return index.ravel(), np.asarray(values).reshape(index.size, *values.shape[2:])
 
-    found = over_cores(block, range(0, len(parts), size))
-    index, values = (np.concatenate(column) for column in zip(*found, strict=True))
+    results = over_cores(block, range(0, len(parts), size))
+    index, values = (np.concatenate(column) for column in zip(*results, strict=True))
     return values[np.unique(index, return_index=True)[1]]
 
 
 def stacked(trees: Sequence[T]) -> T:
     """One tree whose arrays have a leading axis over `trees`.
 
-    Raises `ValueError` when the trees differ in anything but the numbers in their arrays.
+    Raises `ValueError` when the trees differ in more than the values of their arrays.
     """
     if all(tree is trees[0] for tree in trees):
         n = len(trees)
@@ -102,7 +102,7 @@ def stacked(trees: Sequence[T]) -> T:
 
 
 def taken(tree: T, rows: np.ndarray | int) -> T:
-    """Rows of a stacked tree, on the host."""
+    """The entries `rows` of a stacked tree, on the host."""
     return jax.tree.map(lambda a: np.asarray(a)[rows] if eqx.is_array_like(a) else a, tree)
 
 
@@ -112,9 +112,9 @@ def on_accelerator() -> bool:
 
 
 def mapped(function: Callable[..., R], *rows: Any) -> R:
-    """`function` of every row: one after the other on a CPU, side by side on an accelerator.
+    """`function` of every row: one after the other on a CPU, as a batch on an accelerator.
 
-    On a CPU lanes of a `vmap` wait for the slowest of them and their small matrices are
+    On a CPU the members of a `vmap` wait for the slowest, and their small matrices are
     factorised one by one anyway.
     """
     if on_accelerator():
@@ -123,7 +123,7 @@ def mapped(function: Callable[..., R], *rows: Any) -> R:
 
 
 def cores() -> int:
-    """Threads that work side by side: as many as there are cores, one beside an accelerator."""
+    """Number of worker threads: that of the available cores, or one with an accelerator."""
     if on_accelerator():
         return 1
     if hasattr(os, "sched_getaffinity"):
@@ -139,8 +139,8 @@ def over_cores(
 ) -> list[R]:
     """`function` of every job, in as many threads as there are cores.
 
-    JAX's compiled programs do not hold Python's lock, so they run side by side. `progress` is
-    called with the jobs done and all of them, from the calling thread.
+    JAX's compiled programs release Python's lock, so they run in parallel. `progress` is called
+    with the number of jobs done and their total, from the calling thread.
     """
     workers = min(len(jobs), cores())
     results = []
@@ -155,10 +155,10 @@ def over_cores(
 
 
 def on_one_core(function: Callable[P, R]) -> Callable[P, R]:
-    """A function whose linear algebra on the host does not spread over the cores.
+    """A function whose linear algebra on the host runs in one thread.
 
-    For matrices of a hundred rows threads cost more than they save, and where `over_cores` is at
-    work they take the cores from it: a diagnosis with them takes 1.5 times as long.
+    For matrices of a hundred rows threads cost more than they save, and they compete with those
+    of `over_cores`: a diagnosis takes 1.5 times as long with them.
     """
 
     @wraps(function)
@@ -171,14 +171,14 @@ def on_one_core(function: Callable[P, R]) -> Callable[P, R]:
 
 @cache
 def _linear_algebra() -> ThreadpoolController:
-    """The libraries of linear algebra: to look for them takes longer than many a small problem."""
-    import scipy.linalg  # noqa: F401  # brings a library of its own, which must be there by then
+    """The loaded BLAS libraries; finding them takes longer than many a small problem."""
+    import scipy.linalg  # noqa: F401  # loads a BLAS of its own, which must be found too
 
     return ThreadpoolController()
 
 
 def as_arrays(tree: T) -> T:
-    """Arrays of the host as arrays of the device."""
-    # All at once: one by one they take longer than the programs that use them.
+    """A tree with its NumPy arrays moved to the device."""
+    # In one transfer: one by one they take longer than the programs that use them.
     on_host, fixed = eqx.partition(tree, lambda a: isinstance(a, (np.ndarray, np.generic)))
     return eqx.combine(jax.device_put(on_host), fixed)

@@ -1,4 +1,4 @@
-"""Programs of many small steps, compiled to run one step after the other."""
+"""Compilation of programs of many small operations, which run in sequence on a CPU."""
 
 import warnings
 from collections.abc import Callable
@@ -16,10 +16,10 @@ P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
 
-# pyproject.toml excludes them; who installs one all the same learns why a program stands still.
+# pyproject.toml excludes these versions; this warns whoever installs one all the same.
 if (0, 10) <= jax.__version_info__ < (0, 11, 1):
     warnings.warn(
-        f"jax {jax.__version__} can stand still for ever in batched linear algebra on a CPU: "
+        f"jax {jax.__version__} can deadlock in batched linear algebra on a CPU: "
         "install 0.9.2, or 0.11.1 or newer.",
         RuntimeWarning,
         stacklevel=2,
@@ -28,25 +28,25 @@ if (0, 10) <= jax.__version_info__ < (0, 11, 1):
 _EMITTERS = "xla_cpu_use_fusion_emitters"
 _LEVEL = "xla_backend_optimization_level"
 _OPTIONS: dict[str, str | bool | int] = {
-    # XLA's default order for a CPU lets independent steps run side by side, each in a thread of a
-    # pool. On matrices of a hundred rows handing a step over takes longer than the step; the
-    # cores are put to use by whole curves instead (`blocks.over_cores`).
+    # XLA's default scheduler for a CPU runs independent operations in parallel on a thread pool.
+    # For matrices of a hundred rows the dispatch takes longer than the operation; here whole
+    # curves are distributed over the cores instead (`blocks.over_cores`).
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
-    _EMITTERS: False,  # compiles a third faster, runs as fast
-    _LEVEL: 1,  # compiles an eighth faster, runs as fast
+    _EMITTERS: False,  # compiles a third faster, same run time
+    _LEVEL: 1,  # compiles an eighth faster, same run time
 }
 
 
 def compiled(
     function: Callable[..., R], *, long_loops: bool = False, thoroughly: bool = False
 ) -> Callable[..., R]:
-    """A function of arrays and settings as one program, compiled with the options above.
+    """A function of arrays and settings, compiled as one program with the options above.
 
-    Arrays and floating-point numbers anywhere in the arguments, NumPy's too, are arguments of the
-    program, so that other values do not compile anew; everything else (whole numbers, truth
-    values, text, None) is compiled into it. All results are arrays. Inside another program that
-    one's order of steps rules. `long_loops` over many points at once take half as long again to
-    compile and run 1.5 times faster; walks of many curves `thoroughly` twice, and a tenth faster.
+    Arrays and floating-point numbers anywhere in the arguments, NumPy's too, are traced, so that
+    other values do not recompile; everything else (integers, booleans, text, None) is static. All
+    results are arrays. Inside another program the options of that one apply. With `long_loops`
+    loops over many points compile 1.5 times longer and run 1.5 times faster; with `thoroughly`
+    the tracing of many curves compiles twice as long and runs a tenth faster.
     """
 
     def run(structure: Any, fixed: tuple, arrays: list) -> R:
@@ -60,18 +60,18 @@ def compiled(
     kept: dict[tuple, _Once] = {}
 
     @cache
-    def outermost(hurried: bool) -> Callable[..., R]:
-        return jax.jit(run, static_argnums=(0, 1), compiler_options=_options(hurried, *kind))
+    def outermost(fast_compile: bool) -> Callable[..., R]:
+        return jax.jit(run, static_argnums=(0, 1), compiler_options=_options(fast_compile, *kind))
 
     def whole(
         keeper: ProgramKeeper,
         structure: Any,
         fixed: tuple,
         arrays: list,
-        hurried: bool,
-        *argued: Any,
+        fast_compile: bool,
+        *arguments: Any,
     ) -> Callable[[list], R] | None:
-        """The program as it is kept on disk, from which it is read or to which it is written."""
+        """The program from the cache on disk, compiled and stored there if missing."""
 
         def build() -> tuple[jax.stages.Lowered, Any]:
             trees: list[Any] = []
@@ -82,12 +82,12 @@ def compiled(
                 return leaves
 
             flat.__name__ = f"{function.__name__}_kept"
-            options = _options(hurried, *kind)
+            options = _options(fast_compile, *kind)
             program = jax.jit(flat, compiler_options=options).lower(*arrays)
             return program, jax.tree.unflatten(trees[-1], range(trees[-1].num_leaves))
 
         try:
-            program, like = keeper.program(function, argued, (hurried, *kind), build)
+            program, like = keeper.program(function, arguments, (fast_compile, *kind), build)
         except NotKept:
             return None
         results = jax.tree.structure(like)
@@ -104,16 +104,16 @@ def compiled(
         traced = any(isinstance(a, jax.core.Tracer) for a in arrays)
         if traced:
             return inside(structure, fixed, arrays)
-        hurried = jax.config.read("jax_disable_most_optimizations")
+        fast_compile = jax.config.read("jax_disable_most_optimizations")
         keeper = program_keeper()
         if keeper is not None:
             shapes = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in arrays)
-            once = kept.setdefault((structure, fixed, shapes, hurried), _Once())
-            made_of = keeper, structure, fixed, arrays, hurried, arguments, named
+            once = kept.setdefault((structure, fixed, shapes, fast_compile), _Once())
+            made_of = keeper, structure, fixed, arrays, fast_compile, arguments, named
             program = once.made(lambda: whole(*made_of))
             if program is not None:
                 return program(arrays)
-        return outermost(hurried)(structure, fixed, arrays)
+        return outermost(fast_compile)(structure, fixed, arrays)
 
     return call
 
@@ -126,10 +126,10 @@ def value_of(array: Any) -> np.ndarray | None:
 
 
 def on_numbers(instead: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """A verb that works on numbers: where JAX traces its arguments it states what to use instead.
+    """Refuses traced arguments: the decorated function works on numbers, not under JAX transforms.
 
-    `instead` is a sentence. Without this such a verb ends somewhere inside in an error about
-    tracers, or its derivatives are silently zero.
+    `instead` is a sentence with the differentiable alternative. Without this check such a function
+    fails deep inside with a tracer error, or its derivatives are silently zero.
     """
 
     def of(function: Callable[P, R]) -> Callable[P, R]:
@@ -149,21 +149,20 @@ def on_numbers(instead: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def as_numpy(array: Any) -> Any:
-    """An array as NumPy's, of which parts are taken without a program; a traced one as it is."""
+    """An array as NumPy's, whose indexing compiles nothing; a traced one unchanged."""
     return array if isinstance(array, jax.core.Tracer) else np.asarray(array)
 
 
 def numbers_as_arrays(tree: T) -> T:
-    """A tree whose floating-point and complex numbers of Python are NumPy's.
+    """A tree whose Python floats and complex numbers are converted to NumPy's.
 
-    `compiled` and `eqx.filter_jit` take those as arguments of a program; they would compile
-    Python's numbers into it.
+    `compiled` and `eqx.filter_jit` trace those; Python's numbers they would treat as static.
     """
     return jax.tree.map(_number, tree)
 
 
 def jitted(function: Callable[P, R]) -> Callable[P, R]:
-    """`eqx.filter_jit` of a function whose floating-point numbers are arguments of the program."""
+    """`eqx.filter_jit` of a function, with its floating-point numbers traced."""
     inside = eqx.filter_jit(function)
 
     @wraps(function)
@@ -176,7 +175,7 @@ def jitted(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _in_double_precision() -> None:
-    """Raises `ValueError` where JAX was switched to single precision: nothing would converge."""
+    """Raises `ValueError` if JAX was switched to single precision: no solver would converge."""
     if not jax.config.read("jax_enable_x64"):
         raise ValueError(
             "JAX computes in single precision: `jax_enable_x64`, which `import snrmjax` switches "
@@ -189,18 +188,18 @@ def _number(leaf: Any) -> Any:
 
 
 class _Array:
-    """Stands where an array was taken out."""
+    """Placeholder of an array in the static part."""
 
 
 class _Once:
-    """What is made at the first call, in whichever thread that is."""
+    """A value made at the first request, by whichever thread comes first."""
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._made: list[Any] = []
 
     def made(self, make: Callable[[], T]) -> T:
-        """What `make` made, now or before."""
+        """The value of `make`, which is called once."""
         with self._lock:
             if not self._made:
                 self._made.append(make())
@@ -208,14 +207,14 @@ class _Once:
 
 
 @cache
-def _options(hurried: bool, long_loops: bool, thoroughly: bool) -> dict[str, str | bool | int]:
-    """Those that this version of XLA has; none where the programs do not run on a CPU.
+def _options(fast_compile: bool, long_loops: bool, thoroughly: bool) -> dict[str, str | bool | int]:
+    """The options known to this version of XLA; none if programs do not run on a CPU.
 
-    A level of ours would overrule a user who asks JAX to compile in a hurry.
+    An optimisation level set here would override the user's `jax_disable_most_optimizations`.
     """
     if jax.default_backend() != "cpu":
         return {}
-    left_out = (_LEVEL,) * (hurried or thoroughly) + (_EMITTERS,) * (long_loops or thoroughly)
+    left_out = (_LEVEL,) * (fast_compile or thoroughly) + (_EMITTERS,) * (long_loops or thoroughly)
     wanted = {k: v for k, v in _OPTIONS.items() if k not in left_out}
     if _known(wanted):
         return wanted

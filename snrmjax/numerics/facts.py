@@ -1,4 +1,4 @@
-"""Facts: what a result has to tell, as a kind and its numbers; sentences are made from them."""
+"""Facts: typed statements about a result, a kind with values, from which sentences are made."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -7,12 +7,12 @@ from snrmjax.numerics import rendering
 
 
 class Fact(Mapping[str, Any]):
-    """One thing that a reader should know: a note, an assumption, a piece of evidence, advice.
+    """A statement for the reader: a note, an assumption, a piece of evidence, advice.
 
-    Its `kind` says what, its values, by name, how much and where (`level=3`, `gain=1.02`,
-    `frequency_hz=79.1`: a name ends in the unit where that is none of the SI). Code branches on
-    these alone. `str(fact)` is the sentence, from the one place that words the kind
-    (`snrmjax.report.sentences`). Facts compare and hash by kind and values.
+    It has a `kind` and named values (`level=3`, `gain=1.02`, `frequency_hz=79.1`: a name ends in
+    the unit where that is not the SI unit). Code branches on these alone. `str(fact)` is the
+    sentence, worded in one module (`snrmjax.report.sentences`). Facts compare and hash by kind and
+    values.
 
     >>> fact = Fact("harmonics_without_error", n_states=3)
     >>> fact.kind, fact["n_states"]
@@ -26,7 +26,7 @@ class Fact(Mapping[str, Any]):
         self._values = values
 
     def __getitem__(self, name: str) -> Any:
-        """A value by its name."""
+        """The value of this name."""
         return self._values[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -44,9 +44,9 @@ class Fact(Mapping[str, Any]):
         return hash((self.kind, *self._values.items()))
 
     def __str__(self) -> str:
-        """The sentence that tells it."""
+        """The fact as a sentence."""
         return rendering.worded(self)
 
     def __repr__(self) -> str:
-        """As it is written in code."""
+        """The fact as it is constructed in code."""
         return ", ".join([f"Fact({self.kind!r}", *(f"{k}={v!r}" for k, v in self.items())]) + ")"

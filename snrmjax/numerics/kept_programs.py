@@ -1,4 +1,4 @@
-"""The one door to programs that are kept on disk; `snrmjax.io.programs` stands behind it."""
+"""Access to the cache of compiled programs on disk, implemented by `snrmjax.io.programs`."""
 
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -7,14 +7,14 @@ import jax
 
 
 class NotKept(Exception):
-    """A program depends on code that is not this package's."""
+    """A program depends on code outside this package and is not cached."""
 
 
 class ProgramKeeper(Protocol):
-    """Finds whole programs, or has them compiled and keeps them."""
+    """A cache of compiled programs: looks them up, or has them compiled and stores them."""
 
     def in_use(self) -> bool:
-        """Whether programs are kept under the settings of JAX that rule now."""
+        """Whether programs are cached under the current settings of JAX."""
 
     def program(
         self,
@@ -23,30 +23,30 @@ class ProgramKeeper(Protocol):
         settings: tuple,
         build: Callable[[], tuple[jax.stages.Lowered, Any]],
     ) -> tuple[Callable[..., list[jax.Array]], Any]:
-        """The program of flat arrays for a function's arguments, and a tree like its results.
+        """The program of flat arrays for a function's arguments, and the structure of its results.
 
-        Arguments: `settings` of the compiler; `build` lowers the program where none is kept,
-        under a name that no other has.
-        Raises `NotKept` where it could not be told from another.
+        Arguments: `settings` of the compiler; `build` lowers the program, under a unique name,
+        if it is not in the cache.
+        Raises `NotKept` if no unique key can be made for it.
         """
 
 
-class _Door:
+class _Registered:
     keeper: ProgramKeeper | None = None
     closed = False
 
 
 def keep_programs_with(keeper: ProgramKeeper) -> None:
-    """Have programs kept from here on, unless the package has code of others in it."""
-    _Door.keeper = None if _Door.closed else keeper
+    """Cache programs from here on, unless code from outside is registered in the package."""
+    _Registered.keeper = None if _Registered.closed else keeper
 
 
 def keep_no_programs() -> None:
-    """From here on the package does what it does with code of others in it."""
-    _Door.closed, _Door.keeper = True, None
+    """Stop caching for good: code from outside is registered in the package."""
+    _Registered.closed, _Registered.keeper = True, None
 
 
 def program_keeper() -> ProgramKeeper | None:
-    """Who keeps programs, if they are kept now."""
-    keeper = _Door.keeper
+    """The cache of programs, if it is in use now."""
+    keeper = _Registered.keeper
     return keeper if keeper is not None and keeper.in_use() else None

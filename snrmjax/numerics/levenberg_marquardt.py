@@ -1,9 +1,9 @@
 """Levenberg–Marquardt for small problems from several starting points at once, with early stopping.
 
-The joint fit takes optimistix's solver, which is compiled for one problem. Here an evaluation is
-costly, answers for many points in one call and lives on the host: all starting points step
-together, those that promise least are given up after a few steps, and a step too short to matter
-is taken without another evaluation.
+The joint fit uses optimistix's solver, which is compiled for one problem. Here an evaluation is
+costly, covers many points in one call and runs on the host: all starting points step together,
+the least promising are dropped after a few steps, and a negligible last step is taken without
+another evaluation.
 """
 
 import dataclasses
@@ -21,9 +21,9 @@ class MinimisationStatus(StrEnum):
     CONVERGED = "converged"  # a further step changes the sum of squares by less than `settled`
     STALLED = "stalled"  # no step lowers the sum of squares, however short
     STEP_LIMIT = "step_limit"  # still falling after the last step
-    GIVEN_UP = "given_up"  # another starting point, or another fit, was more promising
+    GIVEN_UP = "given_up"  # dropped: another starting point, or another fit, was more promising
     NOT_FINITE = "not_finite"  # no finite residuals at the starting point
-    NOT_FITTED = "not_fitted"  # a starting point, or a model without anything to fit
+    NOT_FITTED = "not_fitted"  # a starting point, or a model without free parameters
 
     @property
     def found_minimum(self) -> bool:
@@ -32,7 +32,7 @@ class MinimisationStatus(StrEnum):
 
 
 class AbstractLinearisation(Protocol):
-    """A least-squares problem at one point, as its evaluation gives it."""
+    """A least-squares problem evaluated at one point."""
 
     @property
     def residuals(self) -> Float[np.ndarray, " row"]:
@@ -40,7 +40,7 @@ class AbstractLinearisation(Protocol):
 
     @property
     def jacobian(self) -> Float[np.ndarray, "row unknown"]:
-        """Their derivatives by the unknowns."""
+        """Their derivatives with respect to the unknowns."""
 
 
 Linearisation = TypeVar("Linearisation", bound=AbstractLinearisation)
@@ -50,11 +50,11 @@ Linearisation = TypeVar("Linearisation", bound=AbstractLinearisation)
 class StepRule:
     """How steps are damped, and when a fit ends.
 
-    Marquardt's damping begins at `damping`, is multiplied by `eased` after a step that lowers the
-    sum of squares and by `stiffened` after one that does not; beyond `largest_damping` no step
-    will. A fit ends when a step lowers the sum by less than `settled`, or after `steps`. After
-    `screened` steps only the `kept` best starting points go on. With `trust_short_steps` a step
-    that promises less than `settled` is the last and is not evaluated.
+    Marquardt's damping starts at `damping`, is multiplied by `eased` after a step that lowers the
+    sum of squares and by `stiffened` after one that does not; above `largest_damping` the fit has
+    stalled. A fit ends when a step lowers the sum by less than `settled`, or after `steps`. After
+    `screened` steps only the `kept` best starting points continue. With `trust_short_steps` a step
+    with a predicted reduction below `settled` is the last and is not evaluated.
     """
 
     steps: int = 30
@@ -72,9 +72,9 @@ class Minimum(NamedTuple, Generic[Linearisation]):
     """Where a fit from one starting point ended."""
 
     point: Float[np.ndarray, " unknown"]
-    sum_of_squares: float  # infinite where nothing finite was found
+    sum_of_squares: float  # infinite if no finite value was reached
     linearised: Linearisation  # at `point`, or a short last step before it
-    last_step: Float[np.ndarray, " unknown"]  # from where it was linearised; zero if evaluated
+    last_step: Float[np.ndarray, " unknown"]  # from the point of linearisation; zero if evaluated
     status: MinimisationStatus
 
 
@@ -87,13 +87,13 @@ def minimise(
 ) -> list[Minimum[Linearisation]]:
     """Minimise |r(x)|² from several starting points.
 
-    A step solves (JᵀJ + λ diag(JᵀJ)) s = −Jᵀr. It is cut off at the bounds, each unknown by
-    itself: where a bound holds one of them, the others may end short of their best values.
+    A step solves (JᵀJ + λ diag(JᵀJ)) s = −Jᵀr. It is clipped at the bounds, each unknown by
+    itself: with one unknown at its bound the others may end short of their best values.
 
-    Arguments: `evaluate` linearises the problem at some points in one call; `points` are the
-    starting points and `at_points` the problem there; `bounds` are the lowest and the highest
-    value of every unknown.
-    Returns a `Minimum` for every starting point; its `status` says whether it is one.
+    Arguments: `evaluate` linearises the problem at several points in one call; `points` are the
+    starting points and `at_points` the problem linearised there; `bounds` are the lowest and the
+    highest value of every unknown.
+    Returns a `Minimum` for every starting point; its `status` shows whether it converged.
 
     Reference: Marquardt, SIAM J. Appl. Math. 11 (1963) 431, doi:10.1137/0111030.
     """
@@ -107,8 +107,8 @@ def minimise(
         for value in square
     ]
     active = np.isfinite(square)
-    for turn in range(rule.steps):
-        if turn == rule.screened:
+    for iteration in range(rule.steps):
+        if iteration == rule.screened:
             behind = active & ~(square <= np.sort(square)[min(rule.kept, len(point)) - 1])
             status = [
                 MinimisationStatus.GIVEN_UP if b else s for b, s in zip(behind, status, strict=True)
@@ -121,8 +121,8 @@ def minimise(
             moved[t] = np.clip(point[t] + step, lower, upper)
             free = np.array_equal(moved[t], point[t] + step)
             after = residuals + jacobian @ step
-            promised = float(residuals @ residuals - after @ after)
-            if rule.trust_short_steps and free and promised < rule.settled:
+            predicted = float(residuals @ residuals - after @ after)
+            if rule.trust_short_steps and free and predicted < rule.settled:
                 point[t], last_step[t], square[t] = moved[t], step, float(after @ after)
                 status[t], active[t] = MinimisationStatus.CONVERGED, False
         at = np.flatnonzero(active)
@@ -150,12 +150,12 @@ def damped_step(
     residuals: Float[np.ndarray, " row"],
     damping: float,
 ) -> Float[np.ndarray, " unknown"]:
-    """Marquardt's step with unknowns in units of their columns' lengths."""
-    size = np.linalg.norm(jacobian, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    scaled = jacobian / size
-    matrix = scaled.T @ scaled + damping * np.eye(len(size))
-    return -np.linalg.solve(matrix, scaled.T @ residuals) / size
+    """Marquardt's damped step, with each unknown scaled by the norm of its column of J."""
+    norm = np.linalg.norm(jacobian, axis=0)
+    norm = np.where(norm > 0, norm, 1.0)
+    scaled = jacobian / norm
+    matrix = scaled.T @ scaled + damping * np.eye(len(norm))
+    return -np.linalg.solve(matrix, scaled.T @ residuals) / norm
 
 
 def _sum_of_squares(linearised: AbstractLinearisation) -> float:

@@ -1,13 +1,13 @@
-"""Near misses among names, as messages suggest them."""
+"""Suggestions for misspelt names in error messages."""
 
 import difflib
 from collections.abc import Iterable
 
 
 def near_miss(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """The known name that is most like a given one, upper or lower case, or nothing.
+    """The known name most similar to a given one, ignoring case, or None.
 
-    Arguments: `cutoff` is difflib's similarity, from 0 to 1, that the name must reach.
+    Arguments: `cutoff` is the least similarity of difflib, from 0 to 1.
 
     >>> near_miss("Freq_hz", ["level", "frequency_hz"])
     'frequency_hz'
@@ -18,7 +18,7 @@ def near_miss(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | Non
 
 
 def suggestion(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
-    """A near miss among the known names, ready to end a message, or nothing.
+    """The most similar known name as the end of an error message, or an empty string.
 
     >>> suggestion("dampin_ratio", ["damping_ratio", "shape"])
     ' (did you mean `damping_ratio`?)'

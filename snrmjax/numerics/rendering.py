@@ -1,7 +1,7 @@
-"""The one door to `report`: sentences, printed results and figures are made there when wanted.
+"""Access to `report`, where sentences, printed results and figures are made on demand.
 
-Rooms below `report` never import it; what they hold is typed values. `import snrmjax` says which
-modules show them.
+Packages below `report` never import it: they hold typed values. `import snrmjax` registers the
+modules that render them.
 """
 
 import importlib
@@ -11,27 +11,27 @@ _modules: dict[str, str] = {}
 
 
 def shown_by(*, sentences: str, printed: str, figures: str) -> None:
-    """Names the modules that word facts, print results and draw them; each is imported late."""
+    """Register the modules of sentences, printed results and figures; each is imported late."""
     _modules.update(sentences=sentences, printed=printed, figures=figures)
 
 
 def worded(fact: Any) -> str:
-    """The sentence that tells a `Fact`."""
+    """A `Fact` as a sentence."""
     return _module("sentences").sentence(fact)
 
 
 def on_one_screen(result: Any) -> str:
-    """A result on one screen."""
+    """A result as text for one screen."""
     return _module("printed").screen_of(result)
 
 
 def in_a_notebook(result: Any) -> str:
-    """A result as the HTML that notebooks show."""
+    """A result as HTML for notebooks."""
     return _module("printed").html_of(result)
 
 
 def drawn(result: Any, **settings: Any) -> Any:
-    """The figure that shows a result."""
+    """The figure of a result."""
     return _module("figures").plot_result(result, **settings)
 
 

@@ -1,4 +1,4 @@
-"""What every result can do: say itself on one screen, become a labelled data set, be drawn."""
+"""Base classes of results: printing, conversion to labelled data sets, plotting."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-_ENDINGS = {"Hz": "_hz", "m/s": "_m_s", "m": "_m", "N": "_n", "V": "_v", "J": "_j", "deg": "_deg"}
-# What a field holds over what its unit in files is.
-_SIZES = {"Hz": HERTZ, "deg": DEGREE}
+_SUFFIXES = {"Hz": "_hz", "m/s": "_m_s", "m": "_m", "N": "_n", "V": "_v", "J": "_j", "deg": "_deg"}
+# Internal units (rad/s, rad) per unit in files.
+_UNITS = {"Hz": HERTZ, "deg": DEGREE}
 
 
 class Variable(NamedTuple):
@@ -29,11 +29,11 @@ class Variable(NamedTuple):
     dimensions: tuple[str, ...]
     values: Any  # array of that many dimensions, numbers or text
     unit: str  # "Hz", "m/s", "1"; "" for text
-    meaning: str  # a few words that an engineer reads beside the axis
+    meaning: str  # a few words, as an axis label
 
 
 class _Quantity(NamedTuple):
-    """What a field of a result says of itself."""
+    """Metadata of a field of a result."""
 
     dimensions: tuple[str, ...]
     unit: str
@@ -42,22 +42,22 @@ class _Quantity(NamedTuple):
     of: type[Status] | None
 
     def variables(self, name: str, values: Any) -> dict[str, Variable]:
-        """The field's values in units of files, under the names that files have."""
-        values, ending = np.asarray(values), _ENDINGS.get(self.unit, "")
+        """The field's values in the units and under the names of files."""
+        values, suffix = np.asarray(values), _SUFFIXES.get(self.unit, "")
         if np.iscomplexobj(values):
             stem, parts = self.name or name, (("re", values.real), ("im", values.imag))
             return {
-                f"{stem}_{key}{ending}": self._variable(part, f"{self.meaning}, {key}")
+                f"{stem}_{key}{suffix}": self._variable(part, f"{self.meaning}, {key}")
                 for key, part in parts
             }
         if self.of is not None:
             names = [self.of(int(number)).name.lower() for number in values.ravel()]
             values = np.array(names, dtype=np.str_).reshape(values.shape)
-        elif self.unit in _SIZES:
-            values = values / _SIZES[self.unit]
+        elif self.unit in _UNITS:
+            values = values / _UNITS[self.unit]
         elif not self.unit:
             values = values.astype(np.str_)
-        return {self.name or name + ending: self._variable(values, self.meaning)}
+        return {self.name or name + suffix: self._variable(values, self.meaning)}
 
     def _variable(self, values: np.ndarray, meaning: str) -> Variable:
         return Variable(self.dimensions, values, self.unit, meaning)
@@ -74,34 +74,34 @@ def quantity(
 ) -> Any:
     """A field that is a variable of the result's data set, in place of `equinox.field`.
 
-    Arguments: `dimensions` by name, separated by spaces, "" for a single number; `unit` that files
-    and data sets have ("1" for none, "" for text): a field in "Hz" holds rad/s and one in "deg"
-    rad; `meaning` in a few words; `name` of the variable, where it is not the field's with the
-    unit's ending (complex numbers are two variables: the name, `_re` or `_im`, the ending); `of`
-    the status that whole numbers stand for, which the data set names; others as `equinox.field`.
+    Arguments: `dimensions` by name, separated by spaces, "" for a single number; `unit` in files
+    and data sets ("1" for none, "" for text): a field in "Hz" holds rad/s and one in "deg" rad;
+    `meaning` in a few words; `name` of the variable, by default the field's with the unit's suffix
+    (complex numbers become two variables: name, `_re` or `_im`, suffix); `of` the status that
+    integers stand for, written by name; others as `equinox.field`.
     """
     about = _Quantity(tuple(dimensions.split()), unit, meaning, name, of)
     return eqx.field(metadata={"quantity": about}, **settings)
 
 
 def setting(**settings: Any) -> Any:
-    """A static field that is an attribute of the data set: a method, a number of states, a status.
+    """A static field that is an attribute of the data set, such as a method or a status.
 
-    Statuses and enumerations are written by name there, facts as sentences.
+    Statuses and enumerations are written by name, facts as sentences.
     """
     return eqx.field(static=True, metadata={"setting": True}, **settings)
 
 
 class AbstractShown(eqx.Module):
-    """Base of what says itself: on one screen by `print`, and as a table in a notebook."""
+    """Base of objects that print on one screen and as a table in a notebook."""
 
     def has_screen(self) -> bool:
-        """Whether there are values to show: within `jax.jit` there are none yet."""
+        """Whether there are values to print; not within `jax.jit`."""
         valueless = (jax.core.Tracer, jax.ShapeDtypeStruct)
         return not any(isinstance(leaf, valueless) for leaf in jax.tree.leaves(self))
 
     def __repr__(self) -> str:
-        """One screen; within `jax.jit`, where nothing has a value yet, the fields' shapes."""
+        """The result on one screen; within `jax.jit` the fields' shapes."""
         return rendering.on_one_screen(self) if self.has_screen() else eqx.tree_pformat(self)
 
     def _repr_html_(self) -> str | None:
@@ -112,15 +112,15 @@ class AbstractShown(eqx.Module):
 class AbstractResult(AbstractShown):
     """Base of results: a repr of one screen, `to_xarray()`, `to_pandas()` and `plot()`.
 
-    Fields say by `quantity` and `setting` what a data set has of them; a result with computed
-    quantities adds them to `variables`. Names in `coordinates` label the others; one that is a
-    dimension and no variable counts from 0.
+    Fields declared by `quantity` and `setting` enter the data set; a result with computed
+    quantities adds them to `variables`. Names in `coordinates` become coordinates; one that is
+    only a dimension counts from 0.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ()
 
     def variables(self) -> Mapping[str, Variable]:
-        """Quantities by name, in units of files (Hz, m/s)."""
+        """Quantities by name, in the units of files (Hz, m/s)."""
         variables: dict[str, Variable] = {}
         for field in dataclasses.fields(self):
             if "quantity" in field.metadata:
@@ -129,7 +129,7 @@ class AbstractResult(AbstractShown):
         return variables
 
     def attributes(self) -> Mapping[str, str | float | int]:
-        """What holds for the whole result: settings, statuses, notes."""
+        """Attributes of the whole result: settings, statuses, notes."""
         return {
             field.name: _attribute(getattr(self, field.name))
             for field in dataclasses.fields(self)
@@ -154,9 +154,9 @@ class AbstractResult(AbstractShown):
         return xarray.Dataset(arrays, coords=labels, attrs=dict(self.attributes()))
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """The result as a table, one row a member of its dimension.
+        """The result as a table, one row per entry of its dimension.
 
-        Raises `ValueError` where the variables do not share one dimension: use `to_xarray`.
+        Raises `ValueError` if the variables do not share one dimension: use `to_xarray`.
         """
         data = self.to_xarray()
         if len(data.sizes) != 1:
@@ -168,7 +168,7 @@ class AbstractResult(AbstractShown):
         return data.to_dataframe().reset_index()
 
     def plot(self, **settings: Any) -> "matplotlib.figure.Figure":
-        """The figure that shows this result; `settings` are those of its function in `sj.plot`."""
+        """The figure of this result; `settings` are those of its function in `sj.plot`."""
         return rendering.drawn(self, **settings)
 
 

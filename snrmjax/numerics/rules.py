@@ -1,4 +1,4 @@
-"""Rules for numbers that are read in: the words for what is expected, and the test for it."""
+"""Checks of input numbers: each a condition with its wording for error messages."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Rule(NamedTuple):
-    """What a message says is expected, and the test for it, of a number or of every entry."""
+    """A condition on a number or on every entry, and its wording in a message."""
 
     expected: str
     good: Callable[[Any], Any]
@@ -25,7 +25,7 @@ BETWEEN_ZERO_AND_ONE = Rule("between 0 and 1", lambda value: (value > 0) & (valu
 BETWEEN_ONE_AND_THREE = Rule("above 1 and below 3", lambda value: (value > 1) & (value < 3))
 WHOLE = Rule("a whole number", lambda value: value == np.floor(value))
 SHORT = Rule("of at most 15 digits", lambda value: abs(value) < 1e15)
-# In rad/s it must still be a number.
+# So that it does not overflow in rad/s.
 IN_RANGE_HZ = Rule("below 1e300 Hz", lambda value: value < 1e300)
 
 OF_A_FREQUENCY = (POSITIVE, IN_RANGE_HZ)
@@ -38,9 +38,9 @@ OF_A_DAMPING_RATIO = (BELOW_ONE,)
 def require(subject: str, value: Any, *rules: Rule) -> None:
     """Raises `ValueError` for the first number that is not finite or breaks one of the rules.
 
-    `subject` says what it is, with its backticks. Traced numbers have no value yet: they pass.
+    `subject` names the quantity in the message, with backticks. Traced numbers are not checked.
     """
-    import jax  # late: `snrmjax --help` does not wait for it
+    import jax  # imported late so that `snrmjax --help` is fast
 
     if isinstance(value, jax.core.Tracer):
         return
@@ -48,6 +48,6 @@ def require(subject: str, value: Any, *rules: Rule) -> None:
     for rule in (FINITE, *rules):
         bad = np.argwhere(~np.asarray(rule.good(entries)))
         if len(bad):
-            place = tuple(bad[0].tolist())
-            entry = f"entry {place[0] if len(place) == 1 else place} is" if place else "is"
-            raise ValueError(f"{subject} must be {rule.expected}, but {entry} {entries[place]:g}.")
+            index = tuple(bad[0].tolist())
+            entry = f"entry {index[0] if len(index) == 1 else index} is" if index else "is"
+            raise ValueError(f"{subject} must be {rule.expected}, but {entry} {entries[index]:g}.")

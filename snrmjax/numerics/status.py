@@ -1,10 +1,10 @@
-"""How a computation ended: one family of statuses, each with a message that says what to try."""
+"""How a computation ended: statuses, each with a message and advice on what to try."""
 
 from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Base of statuses: a member is a whole number, as arrays hold it, and its `message`.
+    """Base of statuses: a member is an integer, as arrays hold it, with a `message`.
 
     >>> class SolverStatus(Status):
     ...     CONVERGED = 0, "converged"

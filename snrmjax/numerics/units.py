@@ -1,4 +1,4 @@
-"""Units of files in those in which the package computes, rad/s and rad, and as they are printed."""
+"""Units of files in the internal units rad/s and rad, and units in print."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ DEGREE = np.pi / 180
 
 
 def unit_in_print(unit: str) -> str:
-    """A unit as a reader has it: roots of the kilogram with their sign, nothing for "1".
+    """A unit in print: roots of the kilogram with a root sign, nothing for "1".
 
-    Files and data sets keep the spelling that programs read.
+    Files and data sets keep the plain spelling.
 
     >>> unit_in_print("1/(kg^1/2 m)"), unit_in_print("kg^-1/2"), unit_in_print("1")
     ('1/(√kg m)', '1/√kg', '')

@@ -1,4 +1,4 @@
-"""What each command does, as verbs with plain results; `snrmjax.write_results` writes these.
+"""The commands as functions with plain results; `snrmjax.write_results` writes the results.
 
 Each command in Python, with `import snrmjax as sj` and `from snrmjax.pipelines import *`:
 

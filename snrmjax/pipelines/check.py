@@ -1,4 +1,4 @@
-"""Check: errors of import and of a test, and the imports that mend them."""
+"""Check: errors of import and of a test, and the import commands that correct them."""
 
 import math
 import shlex
@@ -21,12 +21,12 @@ _PER_SECOND = {"displacement": "", "velocity": "/s"}
 
 
 class FilesRead(NamedTuple):
-    """The files that all states were read from: tables of our own, or a laboratory's by a map."""
+    """The files of all states: our own tables, or laboratory files with an import map."""
 
     files: tuple[Path, ...]
     map_file: Path | None = None
-    told: ImportMap = ImportMap()
-    is_base: bool = False  # the motion of a base is in the place of the force
+    mapping: ImportMap = ImportMap()
+    is_base: bool = False  # driven by a base motion instead of a force
 
 
 def check_files(
@@ -36,8 +36,8 @@ def check_files(
 ) -> Checkup:
     """Look for errors in tables of steady states and in records of the same test.
 
-    Arguments: without a `model` scales are not looked at.
-    Returns findings, each with the import that mends it where one does.
+    Arguments: without a `model` scales are not checked.
+    Returns findings, each with the import command that corrects it, where there is one.
     Raises `ValueError` as the readers do.
     """
     structure = None if model is None else read_model(model)
@@ -49,9 +49,9 @@ def check_files(
 
 
 def files_of_test(folder: Path, files: TestFiles, map_file: Path | None = None) -> FilesRead | None:
-    """What the states of a folder were read from; None where nobody says how, or of both kinds.
+    """The files of a folder's states; None without a map, or where both kinds are present.
 
-    Arguments: `map_file` in place of the folder's map.toml.
+    Arguments: `map_file` replaces the folder's map.toml.
     """
     tables = tuple(state.table for state in files.states if state.table is not None)
     records = [record.file.partition(": ")[0] for record in files.records]
@@ -59,20 +59,20 @@ def files_of_test(folder: Path, files: TestFiles, map_file: Path | None = None) 
     if tables and not read:
         is_base = any(state.states.base is not None for state in files.states)
         return FilesRead(tables, is_base=is_base)
-    told = map_file or folder / MAP
-    if tables or not told.is_file():
+    map_path = map_file or folder / MAP
+    if tables or not map_path.is_file():
         return None
     return FilesRead(
-        tuple(folder / name for name in dict.fromkeys(read)), told, read_import_map(told)
+        tuple(folder / name for name in dict.fromkeys(read)), map_path, read_import_map(map_path)
     )
 
 
 def with_imports(checkup: Checkup, read: FilesRead | None) -> Checkup:
-    """The findings with the import that mends each; the first certain one with that of all."""
+    """Findings with the import that corrects each; the first certain one with that for all."""
     if read is None:
         return checkup
     certain = [finding for finding in checkup.findings if is_certain(finding)]
-    told = []
+    advised = []
     for finding in checkup.findings:
         lines = [line for correction in finding.corrections if (line := _command(correction, read))]
         advice = finding.advice
@@ -85,12 +85,12 @@ def with_imports(checkup: Checkup, read: FilesRead | None) -> Checkup:
         ):
             names = tuple(each.name for each in certain)
             advice = Fact("advice_at_once", names=names, command=line, alone=advice)
-        told.append(finding._replace(advice=advice))
-    return Checkup(tuple(told), checkup.notes)
+        advised.append(finding._replace(advice=advice))
+    return Checkup(tuple(advised), checkup.notes)
 
 
 def is_certain(one: Finding) -> bool:
-    """Whether a finding leaves no choice of what all numbers are, and an import can say it."""
+    """Whether a finding has a single interpretation that import options can express."""
     if one.severity != "error" or len(one.corrections) != 1:
         return False
     (correction,) = one.corrections
@@ -98,7 +98,7 @@ def is_certain(one: Finding) -> bool:
 
 
 def _joined(findings: Sequence[Finding]) -> ImportCorrection:
-    """Several findings' corrections as one; each was found with the others' errors mended."""
+    """Several findings' corrections as one; each assumes that the others are corrected."""
     every = [finding.corrections[0] for finding in findings]
     return ImportCorrection(
         response=math.prod(one.response for one in every),
@@ -111,45 +111,45 @@ def _joined(findings: Sequence[Finding]) -> ImportCorrection:
 
 
 def _command(correction: ImportCorrection, read: FilesRead) -> str:
-    """The import that does a correction; empty where no options of it can."""
+    """The import command for a correction; empty where no options express it."""
     own = read.map_file is None
     options = (
         _options_of_own(correction, is_base=read.is_base)
         if own
-        else _options_of_laboratory(correction, read.told)
+        else _options_of_laboratory(correction, read.mapping)
     )
     if not options:
         return ""
-    told = () if own else ("--map", str(read.map_file))
+    by_map = () if own else ("--map", str(read.map_file))
     to = ("--out", str(read.files[0].parent / "mended"))
-    words = ("snrmjax", "import", *map(str, read.files), *told, *options, *to)
+    words = ("snrmjax", "import", *map(str, read.files), *by_map, *options, *to)
     # Double quotes, which every shell knows.
     quoted = [word if shlex.quote(word) == word else f'"{word}"' for word in words]
     return f"`{' '.join(quoted)}`"
 
 
 def _options_of_own(correction: ImportCorrection, *, is_base: bool = False) -> list[str]:
-    """Options that read our own table as what it is; none where it does not hold enough."""
+    """Options that correct our own table; none where the table lacks the information."""
     if correction.force_unit == "V":
         return ["--force-unit", "V"]
     words = []
     if correction.quantity or correction.response != 1:
-        size = f"{correction.response:.8g} " if correction.response != 1 else ""
-        words += ["--unit", f"{size}{_SI[correction.quantity]}"]
+        factor = f"{correction.response:.8g} " if correction.response != 1 else ""
+        words += ["--unit", f"{factor}{_SI[correction.quantity]}"]
     if correction.force != 1:
         words += ["--force-unit", f"{correction.force:.8g} {'m/s^2' if is_base else 'N'}"]
     return [*words, *(["--phase-sign", "lag"] if correction.conjugate else [])]
 
 
-def _options_of_laboratory(correction: ImportCorrection, told: ImportMap) -> list[str]:
-    """Likewise of a laboratory's files by a map: where the units that a finding names are all."""
-    kinds = {response.quantity for response in told.responses}
+def _options_of_laboratory(correction: ImportCorrection, mapping: ImportMap) -> list[str]:
+    """Options for laboratory files with a map; none where new units alone do not correct it."""
+    kinds = {response.quantity for response in mapping.responses}
     named = correction.response == 1 or correction.unit
     named = named and (correction.force == 1 or correction.force_unit)
-    of_base = bool(told.base) and correction.force != 1
+    of_base = bool(mapping.base) and correction.force != 1
     if correction.quantity or not named or len(kinds) != 1 or of_base:
         return []
-    if correction.conjugate and told.record:
+    if correction.conjugate and mapping.record:
         return []
     words = []
     if correction.unit:
@@ -159,5 +159,5 @@ def _options_of_laboratory(correction: ImportCorrection, told: ImportMap) -> lis
         words += ["--unit", f"{correction.unit}{_PER_SECOND.get(kind, '')}"]
     words += ["--force-unit", correction.force_unit] if correction.force_unit else []
     words += ["--phase-unit", correction.phase_unit] if correction.phase_unit else []
-    sign = "lead" if told.phase_sign == "lag" else "lag"
+    sign = "lead" if mapping.phase_sign == "lag" else "lag"
     return [*words, *(["--phase-sign", sign] if correction.conjugate else [])]

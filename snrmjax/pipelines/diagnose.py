@@ -1,4 +1,4 @@
-"""Diagnosis: what a model lacks, and the responses with and without it."""
+"""Diagnosis: missing physics of a model, and responses with and without it."""
 
 import dataclasses
 import logging
@@ -9,13 +9,13 @@ import numpy as np
 
 from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import Diagnosis, FormerAnswer
-from snrmjax.diagnose.location.where import Localisation, few_places, locate_force
+from snrmjax.diagnose.location.where import Localisation, few_attachment_points, locate_force
 from snrmjax.diagnose.response_prediction import (
-    HeldCurve,
+    ControlledVelocityCurve,
     LevelPredictions,
     LevelResponse,
-    held_curves,
-    holds_response,
+    controlled_velocity_curves,
+    is_response_controlled,
     level_forces,
     predict_levels,
 )
@@ -29,35 +29,35 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure, driven_in_newtons
 from snrmjax.numerics.facts import Fact
 
-# Of a completed model's resonance from the measured one: far beyond what levels repeat to.
+# Deviations of a completed model's resonance from the measured one, far above repeatability.
 _FAR_OFF = 0.01  # relative, of frequencies
 _FAR_APART = 0.2  # of the logarithm of velocities
 _log = logging.getLogger(__name__)
 
 
 class SimulatedLevels(NamedTuple):
-    """Responses of all levels, of the model as given and as completed.
+    """Responses of all levels, of the given and of the completed model.
 
-    Where a test holds its response, `held` are the forces that hold it, of both models.
+    For a response-controlled test `held` are the required forces of both models.
     """
 
     predicted: LevelPredictions
-    held: tuple[list[HeldCurve], list[HeldCurve]] | None
+    held: tuple[list[ControlledVelocityCurve], list[ControlledVelocityCurve]] | None
 
 
 class DiagnosedTest(NamedTuple):
-    """A diagnosis, and what was simulated of it."""
+    """A diagnosis, and its simulated responses."""
 
     diagnosis: Diagnosis
     model: Structure  # as given
-    simulated: SimulatedLevels | None = None  # None: not asked for, or nothing to simulate
-    where: Localisation | None = None  # None: nothing is missing, or there is but one place
+    simulated: SimulatedLevels | None = None  # None: not requested, or nothing to simulate
+    where: Localisation | None = None  # None: nothing missing, or a single point
 
     @property
     def is_placed(self) -> bool:
-        """Whether the answer is a law at one place, which explains all sensors to the noise.
+        """Whether the answer is a law at one point that explains all sensors within the noise.
 
-        The law alone that is named for the mode as a whole stays with the mode.
+        A single effect named for the whole mode remains an effect on the mode.
         """
         if self.where is None or not self.where.explains:
             return False
@@ -67,10 +67,10 @@ class DiagnosedTest(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict on the whole test, as `diagnosis.json` has it.
+        """The verdict on the whole test, as in `diagnosis.json`.
 
-        `diagnosis.verdict` is that on effects of the mode alone, by the reference sensor; where a
-        law at one place explains all sensors, its verdict takes the place of theirs.
+        `diagnosis.verdict` is that on effects on the mode, by the reference sensor; a law at one
+        point that explains all sensors replaces it.
         """
         if self.where is not None and self.is_placed:
             return Verdict(placed_answer(self.where)["verdict"])
@@ -90,84 +90,90 @@ def diagnose_test(
     former: FormerAnswer | None = None,
     where: Sequence[str] = (),
 ) -> DiagnosedTest:
-    """Find what the model lacks and where; if asked for, simulate all levels with and without it.
+    """Find and locate the missing physics of a model; optionally simulate all levels with it.
 
-    Arguments: `former` answer of fewer states; `where` it may be, points and pairs ("x3-x2"), by
-    default all points and neighbouring pairs if there are several sensors and few points. Where no
-    structure can have the parameters found, nothing is simulated.
+    Arguments: `former` answer from fewer states; `where` are candidate points and pairs ("x3-x2"),
+    by default all points and neighbouring pairs if there are several sensors and few points. Where
+    no structure can have the identified parameters, nothing is simulated.
     Raises `ValueError` as `diagnose_model` and `locate_force` do.
     """
     model = driven_in_newtons(model)
     _log.info("compares %d states with the model", len(data.frequency))
-    found = diagnose_model(model, data, former=former)
+    diagnosis = diagnose_model(model, data, former=former)
     _log.info("looks for the point where the missing force acts")
-    place = _localisation(found, data, model, where)
-    if place is not None and DiagnosedTest(found, model, where=place).is_placed:
-        found = _completed_at(found, place)
-    if not (simulate and found.effects and found.completed is not None):
-        return DiagnosedTest(found, model, where=place)
+    location = _localisation(diagnosis, data, model, where)
+    if location is not None and DiagnosedTest(diagnosis, model, where=location).is_placed:
+        diagnosis = _completed_at(diagnosis, location)
+    if not (simulate and diagnosis.effects and diagnosis.completed is not None):
+        return DiagnosedTest(diagnosis, model, where=location)
     _log.info("simulates the responses of all levels")
-    simulated = simulated_levels(found, model)
-    n, of = len(simulated.predicted.levels), len(level_forces(data, found.force_misfit.sensor))
+    simulated = simulated_levels(diagnosis, model)
+    n, of = len(simulated.predicted.levels), len(level_forces(data, diagnosis.force_misfit.sensor))
     if n < of:
         note = Fact("some_levels_simulated", n=n, of=of)
-        found = dataclasses.replace(found, notes=(*found.notes, note))
+        diagnosis = dataclasses.replace(diagnosis, notes=(*diagnosis.notes, note))
     levels = tuple(each.level for each in simulated.predicted.levels if not each.complete)
     if levels:
         note = Fact("responses_not_complete", levels=levels)
-        found = dataclasses.replace(found, notes=(*found.notes, note))
+        diagnosis = dataclasses.replace(diagnosis, notes=(*diagnosis.notes, note))
     missed = tuple(each.level for each in simulated.predicted.levels if _is_missed(each))
     if missed:
         note = Fact("resonances_missed", levels=missed)
-        found = dataclasses.replace(found, notes=(*found.notes, note))
-    return DiagnosedTest(found, model, simulated, place)
+        diagnosis = dataclasses.replace(diagnosis, notes=(*diagnosis.notes, note))
+    return DiagnosedTest(diagnosis, model, simulated, location)
 
 
-def _completed_at(found: Diagnosis, place: Localisation) -> Diagnosis:
-    """The diagnosis whose completed model has the law at its place."""
-    answer = found.answer._replace(completed=place.model)
-    checks = found.checks._replace(completed_without={})  # these have effects on the mode
-    notes = [note for note in found.notes if getattr(note, "kind", "") != "other_sensors_missed"]
-    return dataclasses.replace(found, answer=answer, checks=checks, notes=tuple(notes))
+def _completed_at(diagnosis: Diagnosis, location: Localisation) -> Diagnosis:
+    """The diagnosis with the law at its point in the completed model."""
+    answer = diagnosis.answer._replace(completed=location.model)
+    checks = diagnosis.checks._replace(completed_without={})  # they have effects on the mode
+    notes = [
+        note for note in diagnosis.notes if getattr(note, "kind", "") != "other_sensors_missed"
+    ]
+    return dataclasses.replace(diagnosis, answer=answer, checks=checks, notes=tuple(notes))
 
 
 def _is_missed(level: LevelResponse) -> bool:
     """Whether the completed model has no resonance, or one far from the level's measured one."""
-    there, after = level.measured, level.completed
-    if np.isfinite(there.frequency) and not np.isfinite(after.frequency):
+    measured, completed = level.measured, level.completed
+    if np.isfinite(measured.frequency) and not np.isfinite(completed.frequency):
         return level.complete
-    off = abs(after.frequency - there.frequency) > _FAR_OFF * there.frequency
-    return bool(off or abs(np.log(after.velocity / there.velocity)) > _FAR_APART)
+    off = abs(completed.frequency - measured.frequency) > _FAR_OFF * measured.frequency
+    return bool(off or abs(np.log(completed.velocity / measured.velocity)) > _FAR_APART)
 
 
 def _localisation(
-    found: Diagnosis, data: SteadyStates, model: Structure, where: Sequence[str]
+    diagnosis: Diagnosis, data: SteadyStates, model: Structure, where: Sequence[str]
 ) -> Localisation | None:
-    """Where the force acts that a model lacks, if it lacks one and there is a choice."""
-    missing = found.verdict not in (Verdict.NOTHING_MISSING, Verdict.NOISE_REJECTED)
-    told = np.isfinite(np.asarray(data.force)).any() and not np.asarray(data.phase_unknown).any()
-    asked = bool(where) or (len(data.sensors) > 1 and few_places(model))
-    return locate_force(data, model, where) if missing and told and asked else None
+    """Location of the missing force, if there is one and several points are possible."""
+    missing = diagnosis.verdict not in (Verdict.NOTHING_MISSING, Verdict.NOISE_REJECTED)
+    complete = (
+        np.isfinite(np.asarray(data.force)).any() and not np.asarray(data.phase_unknown).any()
+    )
+    located = bool(where) or (len(data.sensors) > 1 and few_attachment_points(model))
+    return locate_force(data, model, where) if missing and complete and located else None
 
 
 def simulated_levels(diagnosis: Diagnosis, model: Structure) -> SimulatedLevels:
-    """Resonances and responses of all levels, with the model as given and as completed.
+    """Resonances and responses of all levels, of the given and of the completed model.
 
     Raises `ValueError` where there is no completed model.
     """
     data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
     predicted = predict_levels(diagnosis, model)
-    if diagnosis.completed is None or not holds_response(data, predicted.levels):
+    if diagnosis.completed is None or not is_response_controlled(data, predicted.levels):
         return SimulatedLevels(predicted, None)
-    given = held_curves(model, data, sensor)
-    completed = held_curves(diagnosis.completed, data, sensor, diagnosis.answer.force_gain)
+    given = controlled_velocity_curves(model, data, sensor)
+    completed = controlled_velocity_curves(
+        diagnosis.completed, data, sensor, diagnosis.answer.force_gain
+    )
     return SimulatedLevels(predicted, (given, completed))
 
 
 def read_test(
     data: FilePath, model: FilePath, further: Sequence[FilePath] = ()
 ) -> tuple[Structure, SteadyStates]:
-    """A model, and a table of steady states with those of further tables of the same structure."""
+    """A model, and the steady states of a table and of further tables of the same structure."""
     structure = read_model(model)
     measured = read_steady_states(data, structure)
     for path in further:

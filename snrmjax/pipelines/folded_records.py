@@ -1,4 +1,4 @@
-"""The settled steps of a record, each folded to one period of its force."""
+"""The settled steps of a record, each folded to one period of the force."""
 
 from typing import NamedTuple
 
@@ -10,13 +10,13 @@ from snrmjax.measure.recordings.stepped_sine import SteppedSineStates
 from snrmjax.measure.recordings.time_recording import TimeRecording
 
 _ORDERS = (0, 1, 2, 3, 4, 5)
-_MOST = 20_000  # samples of a step that are read: of thousands of cycles the last are enough
+_MOST = 20_000  # samples of a step that are used, from its end
 
 
 class FoldedRecord(NamedTuple):
-    """One steady state as it was recorded, folded to a period of the force, and as it was fitted.
+    """One steady state, recorded and fitted, folded to one period of the force.
 
-    Phases count from the force's fundamental; harmonics e^{+ikΩt}, order 0 first.
+    Phases are relative to the force's fundamental; harmonics e^{+ikΩt}, order 0 first.
     """
 
     phase: Float[np.ndarray, " sample"]  # rad, from 0 to 2π
@@ -30,20 +30,20 @@ class FoldedRecord(NamedTuple):
 
 
 def folded_records(
-    recording: TimeRecording, found: SteppedSineStates, force: str, response: str
+    recording: TimeRecording, steps: SteppedSineStates, force: str, response: str
 ) -> list[FoldedRecord | None]:
-    """Every steady state of a record as it was recorded and fitted, in the order of the states.
+    """Every steady state of a record folded to one period, in the order of the states.
 
-    Arguments: `found` what `stepped_sine_states` made of `recording`; `force` and `response` are
+    Arguments: `steps` from `stepped_sine_states` of `recording`; `force` and `response` are
     names of channels. Harmonics 0 to 5 are fitted by least squares to the end of each step; None
     where a period has too few samples for them.
     """
     channel = recording.channels[channel_number(recording.channels, response)]
-    made: list[FoldedRecord | None] = [None] * found.states.n_states
-    for step in np.flatnonzero(np.asarray(found.state) >= 0):
-        omega = float(found.frequency[step])
-        stop = _sample(recording, float(found.stop[step]))
-        start = max(_sample(recording, float(found.settled_from[step])), stop - _MOST)
+    folded: list[FoldedRecord | None] = [None] * steps.states.n_states
+    for step in np.flatnonzero(np.asarray(steps.state) >= 0):
+        omega = float(steps.frequency[step])
+        stop = _sample(recording, float(steps.stop[step]))
+        start = max(_sample(recording, float(steps.settled_from[step])), stop - _MOST)
         if omega * max(_ORDERS) >= np.pi * recording.sampling_rate:
             continue
         both = recording.values([force, response], start, stop)
@@ -54,7 +54,7 @@ def folded_records(
         lead = float(np.angle(phasors[1, 0]))
         phasors = phasors * np.exp(-1j * lead * np.array(_ORDERS))[:, None]
         phase = np.mod(angle + lead, 2 * np.pi)
-        made[int(found.state[step])] = FoldedRecord(
+        folded[int(steps.state[step])] = FoldedRecord(
             phase=phase,
             force=both[0],
             response=both[1],
@@ -64,7 +64,7 @@ def folded_records(
             quantity=channel.quantity,
             unit=channel.si_unit,
         )
-    return made
+    return folded
 
 
 def _sample(recording: TimeRecording, at: float) -> int:

@@ -1,4 +1,4 @@
-"""Identification: backbone and damping from a table of steady states, and what they predict."""
+"""Identification: backbone and damping from steady states, with predicted responses."""
 
 import dataclasses
 import functools
@@ -47,22 +47,22 @@ from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 _log = logging.getLogger(__name__)
 
 BACKBONE_POINTS = 200
-"""Amplitudes at which curves are written."""
+"""Number of amplitudes of the written curves."""
 
-_LOOKED_AT = 100  # amplitudes of curves that are looked at for negative damping
+_CHECKED = 100  # amplitudes at which curves are checked for negative damping
 
 
 class FitDetails(NamedTuple):
-    """A joint fit with what its bands are made of, and what to measure next."""
+    """A joint fit with the contributions to its bands, and advised measurements."""
 
     fit: JointFit
     fractions: tuple[Contribution, ...]
-    advice: NextMeasurements | None  # None: no advice was asked for
-    responses: tuple[FittedResponse, ...]  # under the advised forces, the main curves
+    advice: NextMeasurements | None  # None: not requested
+    responses: tuple[FittedResponse, ...]  # main curves under the advised forces
 
 
 class IdentifiedTest(NamedTuple):
-    """An identification with its predictions and, where they are known, the true responses."""
+    """An identification with its predictions and, for synthetic data, the true responses."""
 
     data: SteadyStates
     model: Structure
@@ -74,7 +74,7 @@ class IdentifiedTest(NamedTuple):
     joint: FitDetails | None = None  # None: curves through points
     truth: NormalModeBranch | None = None
     simulated: tuple[ResponseCurve, ...] = ()
-    coupled: CoupledDetails | None = None  # None: not asked for, and nothing hints at it
+    coupled: CoupledDetails | None = None  # None: not requested, and no second mode responds
 
     @property
     def responses(self) -> list[PredictedResponse]:
@@ -88,7 +88,7 @@ class IdentifiedTest(NamedTuple):
 
     @property
     def advice(self) -> NextMeasurements | None:
-        """What to measure next, where it was asked for."""
+        """Advised measurements, if requested."""
         return None if self.joint is None else self.joint.advice
 
 
@@ -98,22 +98,22 @@ def identify_test(
     options: IdentifyOptions | None = None,
     **settings: Any,
 ) -> IdentifiedTest:
-    """Identify backbone and damping, predict responses, and advise what to measure next.
+    """Identify backbone and damping, predict responses, and advise further measurements.
 
     State by state with curves through the points, or by one joint fit of all states where one of
     `fit`, `free` and `further` is stated.
 
     Arguments: `data` in N or, for a joint fit, in V; `options`, or its fields by keyword.
     Returns an `IdentifiedTest`.
-    Raises `ValueError` for an option without effect, and what `identify_backbone`, `fit_jointly`,
-    `predict_response` and `fitted_response` raise; where columns of the data seem to mean something
-    else the error says so.
+    Raises `ValueError` for an option without effect, and as `identify_backbone`, `fit_jointly`,
+    `predict_response` and `fitted_response` do; where columns of the data are probably
+    misread the error states it.
     """
     options = checked(dataclasses.replace(options or IdentifyOptions(), **settings))
     if model.modes.unbalance is not None and (options.predict_force or options.predict_drive):
         raise ValueError(
             "predictions are for a force in N that is the same at every frequency, but the model's "
-            "[force] is an unbalance: leave `unbalance_kg_m` out of it to predict for one."
+            "[force] is an unbalance: remove `unbalance_kg_m` to predict for a force."
         )
     model = driven_in_newtons(model)
     if options.predict_drive:
@@ -123,23 +123,23 @@ def identify_test(
     coupled, alone = options.modes == COUPLED_MODES, options
     if coupled:  # responses are then those of the coupled modes
         alone = dataclasses.replace(options, predict_force=())
-    found = (
+    identified = (
         _by_joint_fit(data, model, alone) if options.is_joint else _by_points(data, model, alone)
     )
     if not coupled and (options.modes is not None or not other_mode_moves(data, model)):
-        return found
+        return identified
     forces = options.predict_force if coupled else ()
-    # With the gain and the phase that a joint fit found for the instruments.
-    details = coupled_details(found.data, model, found.identification, forces)
-    notes = _each_once((*found.notes, *details.notes()))
-    return found._replace(options=options, coupled=details, notes=notes)
+    # With the gain and the phase that a joint fit identified for the instruments.
+    details = coupled_details(identified.data, model, identified.identification, forces)
+    notes = _each_once((*identified.notes, *details.notes()))
+    return identified._replace(options=options, coupled=details, notes=notes)
 
 
 def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:
     check_phases(data, "an identification")
     check_force(data, "an identification state by state")
     try:
-        found = identify_backbone(
+        identification = identify_backbone(
             data,
             model,
             amplitude=options.amplitude,
@@ -148,17 +148,19 @@ def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -
         )
     except ValueError as error:
         raise with_caveat(error, data, model) from error
-    backbone = found.backbone
-    predictions = predictions_of_points(found, model, options)
-    looked_at = backbone.sampled(_LOOKED_AT, reach=reach_of(options) if predictions else 1.0)
+    backbone = identification.backbone
+    predictions = predictions_of_points(identification, model, options)
+    checked_curves = backbone.sampled(_CHECKED, reach=reach_of(options) if predictions else 1.0)
     notes = (
-        *caveat(data, model, found.points),
-        *found.notes,
-        *notes_on_negative_damping(looked_at),
+        *caveat(data, model, identification.points),
+        *identification.notes,
+        *notes_on_negative_damping(checked_curves),
         *notes_on_predictions(predictions, backbone, data),
     )
     values = backbone.sampled(BACKBONE_POINTS)
-    return IdentifiedTest(data, model, options, found, values, predictions, _each_once(notes))
+    return IdentifiedTest(
+        data, model, options, identification, values, predictions, _each_once(notes)
+    )
 
 
 def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:
@@ -176,45 +178,46 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
     )
     _log.info("fits backbone and damping curves to %d states", len(data.frequency))
     fit = fitted(robust=options.robust)
-    # Curves that outliers have bent may miss other states: a fit in which they weigh little tells.
-    telling = fit if options.robust or not outlying_states(fit).size else fitted(robust=True)
-    outlying = note_on_outlying(telling, robust=options.robust)
+    # Outliers may distort the curves so that other states deviate: a robust fit identifies them.
+    robust_fit = fit if options.robust or not outlying_states(fit).size else fitted(robust=True)
+    outlying = note_on_outlying(robust_fit, robust=options.robust)
     data = corrected_states(data, fit)
-    found = identification_of_fit(data, fit)
+    identification = identification_of_fit(data, fit)
     predictions, trends = predictions_of_fit(fit, options)
     _log.info("compares further measurements")
     advice = next_measurements(fit, options.further) if options.further else None
-    caveats = () if "force_gain" in fit.names() else caveat(data, model, found.points)
-    reach = np.linspace(0.0, reach_of(options) if predictions else 1.0, _LOOKED_AT) * fit.largest[0]
+    caveats = () if "force_gain" in fit.names() else caveat(data, model, identification.points)
+    reach = np.linspace(0.0, reach_of(options) if predictions else 1.0, _CHECKED) * fit.largest[0]
     notes = (
         *caveats,
         *data.notes,
         *outlying,
-        *found.notes,
+        *identification.notes,
         *linear_damping_note(fit, model),
         *_note_on_gain(fit),
         *notes_on_negative_damping(fitted_values(fit, displacement=reach)),
         *trends,
-        *notes_on_predictions(predictions, found.backbone, data),
+        *notes_on_predictions(predictions, identification.backbone, data),
         *(advice.notes if advice else ()),
         *_note_on_advice(advice, options),
     )
     forces = sorted({one.force for one in advice or ()})
     responses = tuple(fitted_response(fit, force)[0] for force in forces)
     details = FitDetails(fit, tuple(contributions(fit)), advice, responses)
-    ends = float(found.backbone.smallest), float(found.backbone.largest)
+    ends = float(identification.backbone.smallest), float(identification.backbone.largest)
     values = fitted_values(fit, displacement=np.linspace(*ends, BACKBONE_POINTS))
     return IdentifiedTest(
-        *(data, model, options, found, values, predictions, _each_once(notes)), joint=details
+        *(data, model, options, identification, values, predictions, _each_once(notes)),
+        joint=details,
     )
 
 
 def _note_on_gain(fit: JointFit) -> tuple[Note, ...]:
-    """The force per volt that was found, where only a drive voltage is known."""
+    """The identified force per volt, where only the drive voltage is known."""
     if not fit.drive_known_only:
         return ()
-    place = fit.names().index("force_gain")
-    std = float(np.sqrt(fit.covariance[place, place]))
+    column = fit.names().index("force_gain")
+    std = float(np.sqrt(fit.covariance[column, column]))
     gain = float(np.exp(fit.unknowns.log_force_gain))
     return (Fact("force_from_drive", newtons_per_volt=gain, relative_std=std),)
 

@@ -1,4 +1,4 @@
-"""Import: a laboratory's files to our tables, and what they hold where nobody says what is what."""
+"""Import: laboratory files to our tables, or a list of their contents."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,11 +16,11 @@ from snrmjax.io.laboratory.reading import read_laboratory_file
 def import_test(
     files: Sequence[FilePath], map_file: FilePath | None = None, **options: Any
 ) -> Imported:
-    """Steady states, or records that stay records, from the files of one test.
+    """Steady states, or unprocessed records, from the files of one test.
 
-    Arguments: `map_file` of an earlier import; `options` of the command by name, which win over it
+    Arguments: `map_file` of an earlier import; `options` of the command by name, which override it
     (`force="CH1"`, `response=["CH2:acceleration:g"]`).
-    Raises `ValueError` as `import_files` does: a question where something cannot be told.
+    Raises `ValueError` as `import_files` does: a question where the content is ambiguous.
     """
     stated = map_of_options(None if map_file is None else Path(map_file), options)
     given = [key for key, value in options.items() if value]
@@ -28,10 +28,10 @@ def import_test(
 
 
 def list_contents(files: Sequence[FilePath], **options: Any) -> list[str]:
-    """What files hold, in lines, and the command that would import them as one test."""
+    """Lines on the contents of files, and the command that would import them as one test."""
     stated = map_of_options(None, options)
     paths = [Path(file) for file in files]
-    held = [read_laboratory_file(path, stated.text_format, stated.even_axis) for path in paths]
-    refuse_unused_axis([key for key, value in options.items() if value], held)
-    lines = [line for one in held for line in listed_contents(one)]
-    return [*lines, *proposed_commands(paths, held)]
+    contents = [read_laboratory_file(path, stated.text_format, stated.even_axis) for path in paths]
+    refuse_unused_axis([key for key, value in options.items() if value], contents)
+    lines = [line for one in contents for line in listed_contents(one)]
+    return [*lines, *proposed_commands(paths, contents)]

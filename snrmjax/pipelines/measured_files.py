@@ -1,4 +1,4 @@
-"""Measured data of a command: tables of steady states and time records, told apart by content."""
+"""Measured data of a command: steady states or time records, distinguished by content."""
 
 import dataclasses
 from pathlib import Path
@@ -22,8 +22,8 @@ def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyState
     """Steady states or time records of one file.
 
     A CSV with a column `time_s` is a time record, one with `level` or `frequency_hz` a table of
-    steady states; whatever else is a laboratory's file, of which the time records are taken.
-    Raises `ValueError` as the readers do, and for a file without either.
+    steady states; any other file is a laboratory's, whose time records are read.
+    Raises `ValueError` as the readers do, and for a file with neither.
     """
     path = Path(path)
     if path.suffix.lower() not in _NOT_CSV and _is_text(path):
@@ -31,8 +31,8 @@ def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyState
             return [read_record_table(path)]
         if _STATES & _header(path) or not _header(path):
             return [read_steady_states(path, structure)]
-    held = read_laboratory_file(path)
-    if not held.recordings:
+    content = read_laboratory_file(path)
+    if not content.recordings:
         raise ValueError(
             f"{file_name(path)} holds no time record (a CSV needs the column time_s) and no table "
             "of steady states (level, frequency_hz, …)."
@@ -40,7 +40,7 @@ def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyState
     name = file_name(path)
     return [
         dataclasses.replace(one, name=f"{one.name} of {name}" if one.name else name)
-        for one in held.recordings
+        for one in content.recordings
     ]
 
 
@@ -50,7 +50,7 @@ def _header(path: Path) -> set[str]:
 
 
 def _is_text(path: Path) -> bool:
-    """Whether a file is text; what cannot be read at all is, so that its reader says why."""
+    """Whether a file is text; True for a missing one, so that its reader reports it."""
     if not path.is_file():
         return True
     with path.open("rb") as file:

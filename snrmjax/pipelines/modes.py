@@ -1,4 +1,4 @@
-"""Linear modes from a laboratory's files: what they are found from, by content, and their scale."""
+"""Linear modes from laboratory files: sources by content, modal fit, scale of the shapes."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -40,12 +40,12 @@ ModalSources = FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]
 
 
 class LinearModesFound(NamedTuple):
-    """Linear modes, how their shapes were scaled, and the fit that they come from."""
+    """Linear modes, the scale of their shapes, and their modal fit."""
 
     name: str
     fitted: ModalFit
     scaled: ScaledModes
-    interest: int  # the mode that tests are about, from zero
+    interest: int  # mode of interest, from zero
     notes: tuple[Fact | str, ...]
 
     @property
@@ -64,11 +64,11 @@ def find_linear_modes(
     progress: Callable[[int, int], None] | None = None,
     **settings: Any,
 ) -> LinearModesFound:
-    """Linear modes with errors, their shapes mass-normalised as asked for.
+    """Linear modes with errors, their shapes mass-normalised as requested.
 
-    Arguments: `sources` as `read_modal_sources` gives them; `options`, or its fields by keyword;
-    `with_mass` the same of a second test with the added mass; `interest` counts from zero;
-    `progress` is called with how many parts of how many of a decay are fitted.
+    Arguments: `sources` from `read_modal_sources`; `options`, or its fields by keyword;
+    `with_mass` are the sources of a second test with the added mass; `interest` counts from zero;
+    `progress` is called with the number of fitted parts of a decay and their total.
     Raises `ValueError` as `find_modes` and `scale_modes` do, and for two ways to scale.
     """
     options = checked(dataclasses.replace(options or ModesOptions(), **settings))
@@ -95,7 +95,7 @@ def find_linear_modes(
     second = None if with_mass is None else find_modes(_as_stated(with_mass, options), **fit)[0]
     scaled = scale_modes(
         fitted,
-        _asked_scale(options, second),
+        _requested_scale(options, second),
         calibration=Calibration(
             options.newtons_per_volt, options.newtons_per_volt_std, options.calibration_std
         ),
@@ -109,9 +109,9 @@ def find_linear_modes(
 
 
 def _as_stated(sources: ModalSources, options: ModesOptions) -> ModalSources:
-    """What options say of phasors and of sampling rates, done.
+    """Sources with the stated phasor convention and sampling rate.
 
-    Raises `ValueError` for records whose few digits leave their rate open.
+    Raises `ValueError` for records whose few digits do not determine their rate.
     """
     if isinstance(sources, FrequencyResponses):
         values = sources.values.conj() if options.conjugated else sources.values
@@ -126,7 +126,7 @@ def _as_stated(sources: ModalSources, options: ModesOptions) -> ModalSources:
 
 
 def _refuse_unused(options: ModesOptions, sources: ModalSources) -> None:
-    """Raise `ValueError` that names an option which has no effect on what the modes come from."""
+    """Raise `ValueError` for an option without effect on modes from these sources."""
     kind = type(sources) if isinstance(sources, FrequencyResponses | SteadyStates) else tuple
     for field in dataclasses.fields(options):
         stated = getattr(options, field.name) != field.default
@@ -141,23 +141,24 @@ def read_modal_sources(
 ) -> FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]:
     """One test from its files: joined frequency responses, steady states, or records of decays.
 
-    Raises `ValueError` that names the file: of mixed kinds, with nothing of these in it, or as its
-    reader says.
+    Raises `ValueError`, with the file's name, for mixed kinds, for a file without such data, and
+    as its reader does.
     """
     paths = [Path(file) for file in files]
-    found = [_read(path) for path in paths]
-    kinds = {type(one) for one in found}
+    sources = [_read(path) for path in paths]
+    kinds = {type(one) for one in sources}
     if len(kinds) > 1:
         listed = ", ".join(
-            f"{path.name} holds {_WORDS[type(one)]}" for path, one in zip(paths, found, strict=True)
+            f"{path.name} holds {_WORDS[type(one)]}"
+            for path, one in zip(paths, sources, strict=True)
         )
         raise ValueError(f"files of one test must be of one kind, but {listed}.")
-    if isinstance(found[0], FrequencyResponses):
-        return joined_responses([one for one in found if isinstance(one, FrequencyResponses)])
-    if isinstance(found[0], SteadyStates):
-        states = [one for one in found if isinstance(one, SteadyStates)]
+    if isinstance(sources[0], FrequencyResponses):
+        return joined_responses([one for one in sources if isinstance(one, FrequencyResponses)])
+    if isinstance(sources[0], SteadyStates):
+        states = [one for one in sources if isinstance(one, SteadyStates)]
         return states[0] if len(states) == 1 else join_steady_states(states)
-    return tuple(record for one in found if isinstance(one, tuple) for record in one)
+    return tuple(record for one in sources if isinstance(one, tuple) for record in one)
 
 
 _UNUSED: dict[type, tuple[str, ...]] = {
@@ -178,13 +179,13 @@ _WORDS = {
 def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording, ...]:
     if path.suffix.lower() == ".csv" and is_own_file(path):
         return read_steady_states(path)
-    held = read_laboratory_file(path)
-    if held.responses:
-        return joined_responses(held.responses)
-    if held.recordings:
+    content = read_laboratory_file(path)
+    if content.responses:
+        return joined_responses(content.responses)
+    if content.recordings:
         forces = [
             c.name
-            for recording in held.recordings
+            for recording in content.recordings
             for c in recording.channels
             if c.quantity == "force"
         ]
@@ -193,14 +194,14 @@ def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording
                 f"{file_name(path)} holds time records with a force ({forces[0]}): modes need "
                 "frequency responses of them, or records of a decay without a force."
             )
-        open_rates = [note for note in held.notes if note.kind == "rate_left_open"]
+        open_rates = [note for note in content.notes if note.kind == "rate_left_open"]
         return tuple(
             dataclasses.replace(record, name=path.name, notes=(*record.notes, *open_rates))
-            for record in held.recordings
+            for record in content.recordings
         )
     raise ValueError(
         f"{file_name(path)} holds neither frequency responses nor records nor our table of steady "
-        "states: `snrmjax import` says what it holds, and a map what its columns are."
+        "states: `snrmjax import` lists its content, and a map assigns its columns."
     )
 
 
@@ -221,8 +222,8 @@ def _sensor_values(option: str, words: Sequence[str]) -> dict[str, float]:
     return values
 
 
-def _asked_scale(options: ModesOptions, with_mass: ModalFit | None) -> Scale | None:
-    """The one way to scale shapes that was asked for; without one, the drive point."""
+def _requested_scale(options: ModesOptions, with_mass: ModalFit | None) -> Scale | None:
+    """The requested scale of the shapes; by default the drive point."""
     drive = DrivePoint(options.drive_point, options.turned)
     ways: dict[str, Scale | None] = {}
     if options.unscaled:
@@ -236,8 +237,8 @@ def _asked_scale(options: ModesOptions, with_mass: ModalFit | None) -> Scale | N
             or not isinstance(with_mass, LinearModalFit)
         ):
             raise ValueError(
-                "an added mass needs its kilograms, the sensor where it is, and frequency "
-                "responses of a second test with it."
+                "an added mass needs its mass in kg, the sensor at it, and frequency responses of "
+                "a second test with it."
             )
         ways["an added mass"] = AddedMassTest(with_mass, options.mass_at, options.second_mass)
     masses = _sensor_values("--sensor-mass", options.sensor_mass)
@@ -247,7 +248,7 @@ def _asked_scale(options: ModesOptions, with_mass: ModalFit | None) -> Scale | N
     for name, value in _sensor_values("--known-shape", known).items():
         ways["a known shape"] = KnownShape(name, value)
     if len(ways) > 1:
-        raise ValueError(f"one scale of the shapes is wanted, but there are {' and '.join(ways)}.")
+        raise ValueError(f"one scale of the shapes is needed, but there are {' and '.join(ways)}.")
     return next(iter(ways.values()), drive)
 
 

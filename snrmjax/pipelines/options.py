@@ -1,7 +1,7 @@
-"""What a command may be asked for: one schema a pipeline, of Python's keywords and of options.
+"""Options of the commands: one schema per pipeline, for Python keywords and command-line options.
 
-A field says its help once; the commands make their options of it (`snrmjax.cli.options`), and a
-pipeline checks that whatever was stated has an effect.
+A field has its help text; the commands build their options from it (`snrmjax.cli.options`), and a
+pipeline checks that every stated option has an effect.
 """
 
 import dataclasses
@@ -15,36 +15,36 @@ FILES = "Files"
 
 
 class Option(NamedTuple):
-    """What a field of options says of itself."""
+    """Description of a field of options."""
 
     help: str
     metavar: str | None = None
-    panel: str | None = None  # its topic; without one it stands in the command's short help
-    least: float | None = None  # that a number may be
-    choices: tuple[str, ...] = ()  # words that it may have, for a shell to complete
-    flag: str = ""  # how it is written, where that is not the name
+    panel: str | None = None  # its topic; without one it is in the command's short help
+    least: float | None = None  # lower bound of a number
+    choices: tuple[str, ...] = ()  # allowed words, for shell completion
+    flag: str = ""  # where it differs from the name
     positive: str = ""  # unit of numbers that must be above zero
-    needs: tuple[str, ...] = ()  # options of which one must be stated beside it
+    needs: tuple[str, ...] = ()  # options of which one must also be stated
     why_needed: str = ""
-    alone: tuple[str, ...] = ()  # options of which none may be stated beside it
+    alone: tuple[str, ...] = ()  # options that exclude it
     why_alone: str = ""
 
 
 def option(default: Any, help: str, metavar: str | None = None, **further: Any) -> Any:
-    """A field of options with its default, the line of its help, and what else `Option` has."""
+    """A field of options with default, help line, and further fields of `Option`."""
     return dataclasses.field(default=default, metadata={"option": Option(help, metavar, **further)})
 
 
 def flag_of(field: dataclasses.Field) -> str:
-    """How a field's option is written: `--predict-force`."""
+    """A field's option on the command line, such as `--predict-force`."""
     return field.metadata["option"].flag or f"--{field.name.replace('_', '-')}"
 
 
 def checked(options: Options) -> Options:
-    """The same options, if all that was stated has an effect.
+    """The same options, if every stated one has an effect.
 
-    Raises `ValueError` that names the option: of a number out of its range, of one that belongs to
-    another which is not stated, or that has no effect beside another.
+    Raises `ValueError`, with the option's name, for a number out of its range, for an option that
+    needs another which is not stated, and for one without effect together with another.
     """
     fields = {field.name: field for field in dataclasses.fields(options)}  # type: ignore[arg-type]
     stated = {name for name, one in fields.items() if getattr(options, name) != one.default}
@@ -60,10 +60,10 @@ def checked(options: Options) -> Options:
                 raise ValueError(f"`{flag}` must be at least {about.least:g}, but is {number:g}.")
         if about.needs and not stated & set(about.needs):
             raise ValueError(f"`{flag}` {about.why_needed}, or leave it out.")
-        beside = [f"`{flag_of(fields[one])}`" for one in about.alone if one in stated]
-        if beside:
+        excluding = [f"`{flag_of(fields[one])}`" for one in about.alone if one in stated]
+        if excluding:
             raise ValueError(
-                f"`{flag}` has no effect beside {' and '.join(beside)}: {about.why_alone}; leave "
+                f"`{flag}` has no effect with {' and '.join(excluding)}: {about.why_alone}; leave "
                 "one of them out."
             )
     return options
@@ -83,26 +83,25 @@ _FOR_PREDICTIONS: dict[str, Any] = {
 }
 
 
-# Of the two curves together; a shell completes them without the import of what they are.
+# Families of both curves, listed here so that shell completion imports no curve.
 FAMILY_NAMES = (
     *("auto", "polynomial", "spline", "smoothing_spline", "power_law", "constant"),
     *("viscous_quadratic", "viscous_coulomb", "viscous_microslip"),
 )
 
 COUPLED_MODES = 2
-"""Of `IdentifyOptions.modes`: a mode and the one that it exchanges energy with."""
+"""Value of `IdentifyOptions.modes` for the mode of interest and one that it is coupled to."""
 
 
 @dataclasses.dataclass(frozen=True)
 class IdentifyOptions:
-    """What `identify` may be asked for."""
+    """Options of `identify`."""
 
     modes: int | None = option(
         None,
         "2: also identify which mode exchanges energy with the mode of interest (1:1, 1:2, 1:3): "
         "writes the completed model.toml, and predictions are then its responses by harmonic "
-        "balance. 1: look at one mode only. Default: look at two where the sensors show a second "
-        "one.",
+        "balance. 1: identify one mode only. Default: two where the sensors show a second mode.",
         "COUNT",
         least=1,
         panel="Coupled modes",
@@ -112,7 +111,7 @@ class IdentifyOptions:
 
     predict_force: tuple[float, ...] = option(
         (),
-        "Predict resonance and response under this force in N; give it again for more.",
+        "Predict resonance and response under this force in N (repeatable).",
         "N",
         positive="N",
     )
@@ -131,11 +130,11 @@ class IdentifyOptions:
         needs=("predict_force",),
         why_needed="belongs to predictions under a force: add `--predict-force` (N)",
         alone=("predict_drive",),
-        why_alone="a drive voltage is that of the test's shaker, where it was",
+        why_alone="a drive voltage is that of the test's shaker, at its own point",
     )
     extrapolate: float | None = option(
         None,
-        "Predict up to this multiple of the largest measured amplitude; 1 ends where the data end. "
+        "Predict up to this multiple of the largest measured amplitude; 1: no extrapolation. "
         "Default: 1.5.",
         "RATIO",
         least=1.0,
@@ -143,51 +142,51 @@ class IdentifyOptions:
     )
     day_std: str | None = option(
         None,
-        "Predict for another day's test, which differs from this one by so much: relative 1σ of "
-        "natural frequency, damping and gain, as 0.001,0.05,0.02.",
+        "Predict a test on another day: relative 1σ of day-to-day changes of natural frequency, "
+        "damping and gain, as 0.001,0.05,0.02.",
         "FREQUENCY,DAMPING,GAIN",
         **_FOR_PREDICTIONS,
     )
     self_excited: bool = option(
         False,
-        "Let extrapolated damping be negative, as no passive structure's is.",
+        "Allow negative extrapolated damping, which no passive structure has.",
         **_FOR_PREDICTIONS,
     )
     amplitude: Literal["displacement", "velocity"] = option(
         "displacement",
-        "Amplitude of which natural frequency and damping are functions: displacement (right for a "
+        "Amplitude over which natural frequency and damping are curves: displacement (right for a "
         "nonlinear stiffness) or velocity.",
         panel=_POINTS,
         alone=_FIT,
-        why_alone="a joint fit names the amplitude with the family, as `--fit "
+        why_alone="a joint fit states the amplitude with the family, as `--fit "
         "polynomial:2@velocity`",
     )
     measure: Literal["fundamental", "peak"] = option(
         "fundamental",
-        "Take the amplitude of the fundamental, or the peak of the motion with its measured "
+        "Use the amplitude of the fundamental, or the peak of the motion with its measured "
         "harmonics.",
         panel=_POINTS,
         alone=_FIT,
-        why_alone="a joint fit takes the fundamental",
+        why_alone="a joint fit uses the fundamental",
     )
     knots: int | None = option(
         None,
-        "Knots of each curve at most. Default: up to 42; curves bend as much as the data ask for.",
+        "Most knots of each curve. Default: up to 42; the roughness penalty is fitted to the data.",
         least=2,
         panel=_POINTS,
         alone=_FIT,
-        why_alone="a joint fit has the size with the family, as `--fit spline:5`",
+        why_alone="a joint fit states the number with the family, as `--fit spline:5`",
     )
     fit: str | None = option(
         None,
-        "Fit all states jointly: auto (curves as smooth as the data ask for), or families of "
+        "Fit all states jointly: auto (smoothness from the data), or families of "
         "backbone and damping, as polynomial:2,constant.",
         "FAMILIES",
         choices=FAMILY_NAMES,
     )
     free: tuple[str, ...] = option(
         (),
-        "Errors of the instruments to be found with the curves: force_gain, force_offset, "
+        "Instrument errors to identify with the curves: force_gain, force_offset, "
         "instrument_phase; several with commas.",
         "NAMES",
         choices=("force_gain", "force_offset", "instrument_phase"),
@@ -201,7 +200,7 @@ class IdentifyOptions:
     )
     further: int | None = option(
         None,
-        "Advise this many further measurements, those that narrow the bands most.",
+        "Advise this many further measurements that narrow the bands most.",
         "COUNT",
         least=1,
         flag="--next",
@@ -209,7 +208,7 @@ class IdentifyOptions:
 
     @property
     def is_joint(self) -> bool:
-        """Whether a joint fit of all states is asked for."""
+        """Whether a joint fit of all states is requested."""
         return self.fit is not None or bool(self.free) or self.further is not None
 
 
@@ -218,11 +217,11 @@ _AFTER = "After a first diagnosis"
 
 @dataclasses.dataclass(frozen=True)
 class DiagnoseOptions:
-    """What `diagnose` may be asked for, beside its data and model."""
+    """Options of `diagnose`, in addition to data and model."""
 
     responses: bool | None = option(
         None,
-        "Simulate the responses of the model as given and as completed, for comparison with the "
+        "Simulate the responses of the given and of the completed model, for comparison with the "
         "data. Default: for a single file.",
         panel="Drawing",
     )
@@ -234,26 +233,26 @@ class DiagnoseOptions:
     )
     plan: Path | None = option(
         None,
-        "Write the measurement that would decide an open answer: a CSV of steady states to be "
-        "filled in.",
+        "Write the measurement that would resolve an ambiguous answer: a CSV of steady states to "
+        "fill in.",
         "FILE",
     )
     add: tuple[Path, ...] = option(
         (),
-        "Further steady states of the same structure, such as a plan that was filled in: one "
+        "Further steady states of the same structure, such as a filled-in plan: one "
         "diagnosis of all states (repeatable).",
         "FILE",
         panel=_AFTER,
     )
     former: Path | None = option(
         None,
-        "diagnosis.json of the states without those of `--add`: fits begin at its answers too, and "
-        "the notes say what the further states changed.",
+        "diagnosis.json of the states without those of `--add`: fits also start at its answers, "
+        "and the notes state what the further states changed.",
         "FILE",
         flag="--continue",
         panel=_AFTER,
         needs=("add",),
-        why_needed="needs further states: name their file with `--add`",
+        why_needed="needs further states: add their file by `--add`",
     )
 
 
@@ -262,21 +261,20 @@ _ANSWERS = "Answers to its questions"
 
 @dataclasses.dataclass(frozen=True)
 class WholeTestOptions:
-    """What `test` may be asked for."""
+    """Options of `test`."""
 
     model: Path | None = option(
         None,
-        "Linear model, in place of the folder's or of frequency responses.",
+        "Linear model that replaces the folder's or frequency responses.",
         "MODEL",
         panel=FILES,
     )
     drive_point: str | None = option(
-        *(None, "Sensor at the force, by which mode shapes are scaled.", "NAME"), panel=_ANSWERS
+        *(None, "Sensor at the force, for the scale of the mode shapes.", "NAME"), panel=_ANSWERS
     )
     map_file: Path | None = option(
         None,
-        "Map of an import (map.toml) that says what columns and channels are, in place of the "
-        "folder's.",
+        "Import map (map.toml) that assigns columns and channels; replaces the folder's.",
         "TOML",
         flag="--map",
         panel=FILES,
@@ -290,31 +288,31 @@ class WholeTestOptions:
     )
     base: Literal["absolute", "relative"] | None = option(
         None,
-        "What the sensors record of a structure whose base moves: their own motion (absolute) or "
-        "that relative to the base. A model.toml says it itself.",
+        "Motion that the sensors record under base excitation: absolute, or relative to the base. "
+        "A model.toml states it itself.",
         "KIND",
         panel=_ANSWERS,
         alone=("drive_point", "model"),
-        why_alone="a base has no drive point, and a model says itself what its sensors record",
+        why_alone="a base has no drive point, and a model states what its sensors record",
     )
-    go_on: bool = option(False, "Go on in spite of errors that the check finds.", panel=_ANSWERS)
-    diagnose: bool = option(True, "Look for what the model lacks, too (a minute or more).")
+    go_on: bool = option(False, "Continue in spite of errors found by the check.", panel=_ANSWERS)
+    diagnose: bool = option(True, "Also diagnose missing physics (a minute or more).")
 
 
 @dataclasses.dataclass(frozen=True)
 class ReduceOptions:
-    """What `rom` may be asked for."""
+    """Options of `rom`."""
 
     tables: Path | None = option(
         None,
-        "Folder with cases.csv and modes.toml: load cases that another code has run.",
+        "Folder with cases.csv and modes.toml: load cases solved by another code.",
         "DIR",
         panel=FILES,
     )
     calculix: Path | None = option(
         None,
         "CalculiX deck of the structure, with its mesh, material and supports. Its load cases are "
-        "kept in a folder beside it (deck.jobs for deck.inp), for later runs.",
+        "kept in a folder next to it (deck.jobs for deck.inp), for later runs.",
         "DECK",
         panel=FILES,
     )
@@ -323,9 +321,9 @@ class ReduceOptions:
         "Numbers of the modes to keep, with --calculix.",
         "1,3",
         needs=("calculix",),
-        why_needed="goes with --calculix: other sources state their modes",
+        why_needed="needs --calculix: other sources state their modes",
     )
-    no_study: bool = option(False, "Leave out the study over the size of the loads.")
+    no_study: bool = option(False, "Leave out the study of the load scale.")
 
 
 _ONE_SCALE = "Scale of the shapes"
@@ -333,7 +331,7 @@ _ONE_SCALE = "Scale of the shapes"
 
 @dataclasses.dataclass(frozen=True)
 class ModesOptions:
-    """What `modes` may be asked for."""
+    """Options of `modes`."""
 
     reference: str | None = option(
         *(None, "Reference channel where there are several.", "NAME"), panel="Fit"
@@ -341,18 +339,18 @@ class ModesOptions:
     level: int | None = option(None, "Level of steady states (default: the lowest).", panel="Fit")
     from_hz: float | None = option(None, "Lower end of the band in Hz.", "HZ")
     to_hz: float | None = option(
-        None, "Upper end of the band in Hz; decays are thinned to it.", "HZ"
+        None, "Upper end of the band in Hz; decays are decimated to it.", "HZ"
     )
     conjugated: bool = option(
-        False, "Responses are those of e^(-iΩt): take their conjugates.", panel="Fit"
+        False, "Responses have the convention e^(-iΩt): use their conjugates.", panel="Fit"
     )
     rate: float | None = option(
         *(None, "Sampling rate in Hz of records whose file has few digits.", "HZ"), panel="Fit"
     )
     poles: str | None = option(
-        None, "Natural frequencies in Hz by hand, as 79.0,427.5.", "HZ,…", panel="Fit"
+        None, "Natural frequencies in Hz chosen by hand, as 79.0,427.5.", "HZ,…", panel="Fit"
     )
-    order: int | None = option(None, "Take the poles of one model order.", panel="Fit")
+    order: int | None = option(None, "Use the poles of this model order.", panel="Fit")
     highest_order: int | None = option(None, "Highest model order.", panel="Fit")
     residual_terms: str = option(
         "auto",
@@ -368,11 +366,11 @@ class ModesOptions:
         choices=("hann",),
     )
     instrument_phase: bool | None = option(
-        None, "Free a phase of the instruments (default: over a voltage only).", panel="Fit"
+        None, "Identify an instrument phase (default: only for a drive voltage).", panel="Fit"
     )
     base: str | None = option(
         None,
-        "The reference is the motion of a base, the responses are: absolute, relative.",
+        "The reference is the base motion; the responses are absolute or relative.",
         "KIND",
         choices=("absolute", "relative"),
     )
@@ -381,7 +379,7 @@ class ModesOptions:
     )
     turned: bool = option(
         False,
-        "The drive point's sensor is against the force.",
+        "The drive point's sensor points against the force.",
         panel=_ONE_SCALE,
         alone=("unscaled",),
         why_alone="unscaled shapes have no drive point",
@@ -402,7 +400,7 @@ class ModesOptions:
     )
     sensor_mass: tuple[str, ...] = option(
         (),
-        "Mass that a sensor stands for, as tip=0.2 (repeatable); with --base, or with "
+        "Mass represented by a sensor, as tip=0.2 (repeatable); with --base, or with "
         "--fixture-mass.",
         "NAME=KG",
         panel=_ONE_SCALE,
@@ -428,7 +426,7 @@ class ModesOptions:
         why_needed="belongs to a calibration: add `--newtons-per-volt`",
     )
     calibration_std: float = option(0.0, "Relative 1σ of response over force.", panel=_ONE_SCALE)
-    free: bool = option(False, "Structure free as a rigid body: write that mode.", panel=_ONE_SCALE)
+    free: bool = option(False, "Free structure: write its rigid-body mode.", panel=_ONE_SCALE)
     mass: float | None = option(
         None, "Its mass in kg, if weighed (implies --free).", panel=_ONE_SCALE
     )

@@ -1,4 +1,4 @@
-"""Responses and resonances that identified curves predict under forces that were asked for."""
+"""Responses and resonances predicted from identified curves under given forces."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -37,14 +37,14 @@ Note = Fact | str
 
 
 class Prediction(NamedTuple):
-    """What the identified curves predict under one force."""
+    """Prediction of the identified curves under one force."""
 
     force: float  # N
     resonances: Sequence[Resonance]  # in order of amplitude
     responses: Sequence[PredictedResponse]  # the main curve first; those of a joint fit with 1σ
-    further: ResonanceDistribution  # of the resonance of a level that was not measured
+    further: ResonanceDistribution  # of the resonance of a new level
     drive: float | None = None  # V, where the force is known as a drive voltage
-    at: str | None = None  # where the force acts, if not where it did in the test
+    at: str | None = None  # point of the force, if not that of the test
     unit: str = "N"  # of the force; m/s² of a base
 
     @property
@@ -54,19 +54,19 @@ class Prediction(NamedTuple):
 
     @property
     def load(self) -> Fact:
-        """The force, and its drive voltage where the force is known as one."""
+        """The force, and its drive voltage if that is known."""
         return Fact("load", force=self.force, drive=self.drive, at=self.at, unit=self.unit)
 
 
 def reach_of(options: IdentifyOptions) -> float:
-    """Up to which multiple of the largest measured amplitude curves are continued."""
+    """Multiple of the largest measured amplitude up to which curves are extrapolated."""
     return LARGEST_AMPLITUDE_RATIO if options.extrapolate is None else options.extrapolate
 
 
 def predictions_of_points(
     identification: Identification, model: Structure, options: IdentifyOptions
 ) -> tuple[Prediction, ...]:
-    """What curves through points predict."""
+    """Predictions of curves through points."""
     fit = identification.fit
     ratio: dict[str, Any] = {"largest_amplitude_ratio": reach_of(options)}
     predictions = []
@@ -92,7 +92,7 @@ def predictions_of_points(
 def predictions_of_fit(
     fit: JointFit, options: IdentifyOptions
 ) -> tuple[tuple[Prediction, ...], tuple[Note, ...]]:
-    """What a joint fit predicts, and notes on trends of its levels, by which bands are wider."""
+    """Predictions of a joint fit, and notes on trends of its levels, which widen the bands."""
     loads: list[tuple[float, float | None, bool]] = []
     for force in dict.fromkeys(options.predict_force):
         by_drive = fit.drive_known_only and options.predict_at is None
@@ -114,9 +114,11 @@ def predictions_of_fit(
         }
         further = predicted_resonance(fit, force, self_excited=options.self_excited, **settings)
         banded = _of_distribution(fitted_response(fit, force, **settings), further)
-        tips = sorted((tip for one in banded for tip in one.resonances), key=lambda t: t.amplitude)
-        place, unit = options.predict_at, fit.modes.force_unit
-        predictions.append(Prediction(force, tips, banded, further, record, place, unit))
+        peaks = sorted(
+            (peak for one in banded for peak in one.resonances), key=lambda t: t.amplitude
+        )
+        point, unit = options.predict_at, fit.modes.force_unit
+        predictions.append(Prediction(force, peaks, banded, further, record, point, unit))
         notes += notes_on_trends(settings["of"].trends, predictions[-1].load)
     return tuple(predictions), tuple(notes)
 
@@ -124,19 +126,19 @@ def predictions_of_fit(
 def _of_distribution(
     responses: list[FittedResponse], further: ResonanceDistribution
 ) -> list[FittedResponse]:
-    """The responses, whose first resonance has 1σ of the distribution that quantiles are of.
+    """The responses, with the first resonance's 1σ from the sampled distribution.
 
-    What a straight line makes of the errors is no distribution where curves end or fall to nothing.
+    A linearised 1σ is not valid where curves end or damping falls to zero.
     """
-    tips = [tip for one in responses for tip in one.resonances]
-    first = min(tips, key=lambda tip: tip.amplitude, default=None)
+    peaks = [peak for one in responses for peak in one.resonances]
+    first = min(peaks, key=lambda peak: peak.amplitude, default=None)
     if first is None or not np.isfinite(further.frequency_std):
         return responses
-    spread = (further.frequency_std, further.velocity_std)
-    changed = dataclasses.replace(first, frequency_std=spread[0], velocity_std=spread[1])
+    std = (further.frequency_std, further.velocity_std)
+    changed = dataclasses.replace(first, frequency_std=std[0], velocity_std=std[1])
     return [
         dataclasses.replace(
-            one, resonances=tuple(changed if tip is first else tip for tip in one.resonances)
+            one, resonances=tuple(changed if peak is first else peak for peak in one.resonances)
         )
         for one in responses
     ]
@@ -154,10 +156,9 @@ def require_drive(data: SteadyStates) -> None:
 def notes_on_predictions(
     predictions: Sequence[Prediction], backbone: Backbone, data: SteadyStates
 ) -> list[Note]:
-    """Forces whose resonance lies beyond the range or the data, or is one of several.
+    """Notes on forces whose resonance is beyond the range or the data, or is one of several.
 
-    Where the curves have none within the range, but a level of that force was measured in
-    resonance, this is said too.
+    Also where the curves have no resonance in the range, but a measured level of that force has.
     """
     notes: list[Note] = []
     for each in predictions:
@@ -187,7 +188,7 @@ def notes_on_predictions(
 
 
 def _day_of(options: IdentifyOptions) -> DayToDay | None:
-    """By how much another day's test differs: the option `--day-std`."""
+    """Day-to-day changes from the option `--day-std`."""
     if options.day_std is None:
         return None
     try:

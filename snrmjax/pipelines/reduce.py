@@ -1,4 +1,4 @@
-"""A reduced-order model from its source: load cases, condensation, and how far it holds."""
+"""A reduced-order model from its source: load cases, condensation, range of validity."""
 
 import dataclasses
 from collections.abc import Callable
@@ -27,21 +27,23 @@ from snrmjax.model.structures import Structure, equilibria
 from snrmjax.numerics.facts import Fact
 from snrmjax.pipelines.options import ReduceOptions, checked
 
-_SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
-_FEW_SCALES = (0.1, 0.3, 1.0, 3.0)  # of a study whose load cases take long
-_MEANINGLESS = 0.5  # share of a force or a coefficient that is missed: beyond it there is no model
-_REFUSED_LINEAR = 0.2  # deviation of the linear stiffness beyond which nothing fits together
+_SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # times the loads of single modes, for the model's range
+_FEW_SCALES = (0.1, 0.3, 1.0, 3.0)  # of a study with expensive load cases
+_MEANINGLESS = 0.5  # relative error of a force or a coefficient above which the model is refused
+_REFUSED_LINEAR = (
+    0.2  # relative deviation of the linear stiffness above which load cases are refused
+)
 
 
 class Reduction(NamedTuple):
-    """A reduced-order model and how it was made."""
+    """A reduced-order model with its source, load cases and study."""
 
     source: ReductionSource
     condensation: Condensation
     structure: Structure
-    displacement: np.ndarray | None  # m that single modes move linearly; None for tables
+    displacement: np.ndarray | None  # m, linear displacement of single modes; None for tables
     study: LoadScaleStudy | None
-    sweep: StaticCases | None  # single modes, far beyond the load cases; None for tables
+    sweep: StaticCases | None  # single modes at larger loads; None for tables
     notes: tuple[Fact | str, ...]
 
     @property
@@ -53,7 +55,7 @@ class Reduction(NamedTuple):
 
     @property
     def mode_names(self) -> list[str]:
-        """Modes as texts name them."""
+        """Modes as named in texts."""
         basis = self.condensation.basis
         hertz = np.asarray(basis.frequency) / HERTZ
         return [f"mode {n} ({h:.4g} Hz)" for n, h in zip(basis.numbers, hertz, strict=True)]
@@ -65,7 +67,7 @@ def reduce_model(
     study: bool = True,
     report: Callable[[int, int], None] | None = None,
 ) -> Reduction:
-    """Run what load cases are missing, condense them, and repeat it over the size of the loads.
+    """Run missing load cases, condense them, and study the influence of the load scale.
 
     Raises `ValueError` where load cases contradict one another or the modes, where they do not
     determine the model, and where none of them has a solution.
@@ -73,9 +75,9 @@ def reduce_model(
     displacement, cases = None, source.cases
     if cases is None:
         displacement, cases = run_load_cases(source)
-    found = reduced_model(source.basis, cases, degree=source.degree)
-    _refuse_contradictions(source, found)
-    compared = _stated_scale_compared(source, found)
+    condensation = reduced_model(source.basis, cases, degree=source.degree)
+    _refuse_contradictions(source, condensation)
+    compared = _stated_scale_compared(source, condensation)
     scales = sweep = None
     if displacement is not None and source.solve is not None:
         far = modal_loads(source.basis, displacement, most_modes=1, levels=_SWEEP)
@@ -89,48 +91,51 @@ def reduce_model(
             scales=source.scales,
             report=report,
         )
-    structure = source.structure(found)
+    structure = source.structure(condensation)
     notes: list[Fact | str] = [*source.notes, *compared]
-    notes += found.warnings
+    notes += condensation.warnings
     if scales is not None and not scales.holds_default:
         notes.append(Fact("load_scale_outside_plateau"))
     states = [one for one in equilibria(structure) if one.stable]
     if len(states) > 1:
         notes.append(Fact("several_equilibria", n=len(states)))
-    return Reduction(source, found, structure, displacement, scales, sweep, tuple(notes))
+    return Reduction(source, condensation, structure, displacement, scales, sweep, tuple(notes))
 
 
-def _refuse_contradictions(source: ReductionSource, found: Condensation) -> None:
+def _refuse_contradictions(source: ReductionSource, condensation: Condensation) -> None:
     if source.cases is None:
         return
-    for warning in found.warnings:
+    for warning in condensation.warnings:
         if warning.kind == "inconsistent_case":
-            raise ValueError(f"{warning}; mend or remove it.")
-    ratio = found.quality.linear_stiffness_ratio
+            raise ValueError(f"{warning}; correct or remove it.")
+    ratio = condensation.quality.linear_stiffness_ratio
     worst = int(np.argmax(np.abs(np.nan_to_num(ratio, nan=1.0) - 1)))
     if abs(ratio[worst] - 1) > _REFUSED_LINEAR:
         raise ValueError(
             f"the load cases show {ratio[worst]:.4g} times the squared natural frequency of mode "
-            f"{found.basis.numbers[worst]} as linear stiffness: units, loads, shapes and "
-            "frequencies do not belong together."
+            f"{condensation.basis.numbers[worst]} as linear stiffness: units, loads, shapes and "
+            "frequencies are inconsistent."
         )
 
 
-def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list[Fact]:
-    """What a stated load scale does to the coefficients, beside the one that would be chosen.
+def _stated_scale_compared(source: ReductionSource, condensation: Condensation) -> list[Fact]:
+    """Note on how a stated load scale changes the coefficients from those of the default scale.
 
-    Raises `ValueError` where the model is none of the structure: where the potential leaves more
-    than half of the nonlinear force of its own load cases, or where a leading coefficient differs
-    from that of the chosen scale by more than half of it.
+    Raises `ValueError` where the model is not valid: where the potential's misfit exceeds half of
+    the nonlinear force of its own load cases, or where a leading coefficient differs from that of
+    the default scale by more than half.
     """
     if source.load_scale is None or source.solve is None or source.thickness is None:
         return []
-    stated, misfit = f"`load_scale` = {source.load_scale:g} thicknesses", found.quality.misfit
+    stated, misfit = (
+        f"`load_scale` = {source.load_scale:g} thicknesses",
+        condensation.quality.misfit,
+    )
     if misfit > _MEANINGLESS:
         raise ValueError(
-            f"with {stated} the potential leaves {100 * misfit:.0f} % of the nonlinear force of "
-            "its own load cases, so that it is no model of the structure: leave the key out, and a "
-            "scale is chosen."
+            f"with {stated} the misfit of the potential is {100 * misfit:.0f} % of the nonlinear "
+            "force of its own load cases, so that the model is not valid: leave the key out for "
+            "the default scale."
         )
     try:
         displacement, cases = run_load_cases(source._replace(load_scale=None))
@@ -141,7 +146,7 @@ def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list
     scale = float(np.max(displacement)) / source.thickness
     monomials, own = chosen.potential.monomials, np.asarray(chosen.potential.coefficient)
     leading = np.flatnonzero(leading_terms(own, typical_displacement(cases), monomials))
-    change = np.asarray(found.potential.coefficient)[leading] / own[leading] - 1
+    change = np.asarray(condensation.potential.coefficient)[leading] / own[leading] - 1
     worst = int(np.argmax(np.abs(change)))
     if not abs(change[worst]) > TOLERANCE:
         return []
@@ -160,7 +165,7 @@ def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list
 def read_reduction_source(
     beam: FilePath | None = None, options: ReduceOptions | None = None, **settings: Any
 ) -> ReductionSource:
-    """What is condensed: a beam file, or tables or a deck by the options; exactly one of them.
+    """Source of the reduction: exactly one of a beam file, load tables and a CalculiX deck.
 
     Raises `ValueError` for none or several of them, and as the readers do.
     """

@@ -1,4 +1,4 @@
-"""Simulation of a model: responses and nonlinear normal mode, with what they do not show."""
+"""Simulation of a model: responses and nonlinear normal mode, with notes on their limits."""
 
 import dataclasses
 import logging
@@ -34,17 +34,17 @@ from snrmjax.simulate.solutions.quasi_periodic import (
 
 _log = logging.getLogger(__name__)
 
-_TRUNCATED = 0.02  # share of the velocity that harmonics left out may have, without a note
-_KNOWN_DAMPING = 1e-5  # relative 1σ of a damping ratio, above which it is said
-_SAME_EVENT = 1e-6  # of the frequency, between an event of a response and a curve of events
+_TRUNCATED = 0.02  # fraction of the velocity in truncated harmonics above which a note is given
+_KNOWN_DAMPING = 1e-5  # relative 1σ of a damping ratio above which a note is given
+_SAME_EVENT = 1e-6  # relative frequency difference between an event and a curve of events
 _ENDS = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)
 
 
 class SimulatedResponses(NamedTuple):
-    """Forced responses of a model, the isolated ones after the main one of their force."""
+    """Forced responses of a model; isolated ones follow the main one of their force."""
 
     curves: tuple[ResponseCurve, ...]
-    sensor: str  # that figures and tables show
+    sensor: str  # of figures and tables
     notes: tuple[Fact, ...]
     events: tuple[EventCurve, ...] = ()  # followed over a parameter
     quasi_periodic: tuple[QuasiPeriodicBranch, ...] = ()
@@ -54,7 +54,7 @@ class SimulatedMode(NamedTuple):
     """The nonlinear normal mode of a model."""
 
     branch: NormalModeBranch
-    sensor: str  # that figures and tables show
+    sensor: str  # of figures and tables
     notes: tuple[Fact, ...]
 
 
@@ -74,14 +74,14 @@ def simulate_responses(
 ) -> SimulatedResponses:
     """Responses to harmonic forces, around folds and with unstable parts.
 
-    Arguments: `forces` in N, or multiples of the model's unbalance; `harmonics` that are balanced;
-    `isolated` also searches for curves that are not connected to the one from rest; `follow` kinds
-    of events that are followed as the `parameter` goes from its value to `to`, and back where it
-    turns (see `follow_event`);
-    `quasi_periodic` follows the motions with two frequencies from every Neimark-Sacker point;
-    `progress` is told each force when it begins.
+    Arguments: `forces` in N, or multiples of the model's unbalance; highest balanced harmonic
+    `harmonics`; `isolated` also searches for curves that are not connected to the main one;
+    `follow` kinds of events that are continued as the `parameter` goes from its value to `to`,
+    and back after a turning point (see `follow_event`); `quasi_periodic` continues the motions
+    with two frequencies from every Neimark-Sacker point; `progress` is called with each force when
+    it starts.
     Raises `ValueError` as `forced_response` and `follow_event` do, where no curve has a point,
-    for events to follow without `to`, or the other way round, and as `check_quasi_periodic` does.
+    for `follow` without `to` or vice versa, and as `check_quasi_periodic` does.
     """
     if follow and to is None:
         raise ValueError("`to` must be given with `follow`: the value that the parameter goes to.")
@@ -91,7 +91,7 @@ def simulate_responses(
         check_quasi_periodic(simulated_structure(model))
     if follow and parameter != FORCE:
         checked_names(model, [parameter], "parameter")
-    # Events are located where the files and figures show the response.
+    # Events are located on the response of the sensor of files and figures.
     ends, settings = (from_hz * HERTZ, to_hz * HERTZ), ResponseSettings(harmonic_order=harmonics)
     sensor = _most_moved(model, ends)
     model = dataclasses.replace(model, modes=model.modes.with_first_sensor(sensor))
@@ -101,11 +101,11 @@ def simulate_responses(
     for force in forces:
         progress(force)
         main = forced_response(model, [force], *ends, harmonic_order=harmonics)
-        mine = [*main]
+        of_force = [*main]
         if isolated:
             _log.info("searches for isolated responses at %g %s", force, model.modes.force_unit)
             further = isolated_responses(model, force, *ends, known=main, settings=settings)
-            mine += further
+            of_force += further
             notes.append(
                 Fact(
                     "isolated_searched",
@@ -115,13 +115,13 @@ def simulate_responses(
                     n_failed=further.n_failed,
                 )
             )
-        notes += list(dict.fromkeys(n for curve in mine for n in _notes_on_curve(curve, hold)))
-        notes += _notes_on_force(model, mine, ends, isolated)
-        curves += mine
+        notes += list(dict.fromkeys(n for curve in of_force for n in _notes_on_curve(curve, hold)))
+        notes += _notes_on_force(model, of_force, ends, isolated)
+        curves += of_force
     if not any(len(curve.frequency) for curve in curves):
-        held = [str(note) for note in notes if note.kind == "held_by_friction"]
-        why = f": {held[0]}" if held else "; start farther from resonance."
-        raise ValueError(f"no response was found in this range{why}")
+        stuck = [str(note) for note in notes if note.kind == "held_by_friction"]
+        why = f": {stuck[0]}" if stuck else "; start farther from resonance."
+        raise ValueError(f"no response was computed in this range{why}")
     estimates = [np.max(c.truncation, initial=0.0) for c in curves if c.truncation is not None]
     fraction = float(max(estimates, default=0.0))
     if fraction > _TRUNCATED:
@@ -130,27 +130,27 @@ def simulate_responses(
     if to is not None:
         for kind in follow:
             _log.info("follows the events %s over %s", kind, parameter)
-            found = _followed(model, curves, kind, parameter, to)
-            notes += [] if found else [Fact("no_event_to_follow", event=kind)]
-            events += found
+            followed = _followed(model, curves, kind, parameter, to)
+            notes += [] if followed else [Fact("no_event_to_follow", event=kind)]
+            events += followed
     tori: list[QuasiPeriodicBranch] = []
     if quasi_periodic:
-        tori, told = _tori(model, curves, ends)
-        notes += told
+        tori, torus_notes = _tori(model, curves, ends)
+        notes += torus_notes
     return SimulatedResponses(*(tuple(curves), sensor, tuple(notes), tuple(events), tuple(tori)))
 
 
 def _tori(
     model: Structure, curves: Sequence[ResponseCurve], ends: tuple[float, float]
 ) -> tuple[list[QuasiPeriodicBranch], list[Fact]]:
-    """Quasi-periodic motions from every Neimark-Sacker point, each once, and what went wrong."""
-    found: list[QuasiPeriodicBranch] = []
+    """Quasi-periodic branches from every Neimark-Sacker point, each once, and notes on failures."""
+    branches: list[QuasiPeriodicBranch] = []
     notes: list[Fact] = []
-    places = [(curve, k) for curve in curves for k in curve.at_events("neimark_sacker")]
-    _log.info("follows quasi-periodic motions from %d Neimark-Sacker points", len(places))
-    for curve, k in places:
+    starts = [(curve, k) for curve in curves for k in curve.at_events("neimark_sacker")]
+    _log.info("follows quasi-periodic motions from %d Neimark-Sacker points", len(starts))
+    for curve, k in starts:
         frequency = float(curve.frequency[k])
-        if any(b.force == curve.force and b.ends_at(frequency) for b in found):
+        if any(b.force == curve.force and b.ends_at(frequency) for b in branches):
             continue
         where = {"force": curve.force, "frequency_hz": frequency / HERTZ}
         try:
@@ -162,28 +162,28 @@ def _tori(
             why = f"the branch ended {branch.status.message}."
             notes.append(Fact("torus_not_followed", **where, why=why))
             continue
-        found.append(branch)
-    return found, notes if places else [Fact("no_event_to_follow", event="Neimark-Sacker point")]
+        branches.append(branch)
+    return branches, notes if starts else [Fact("no_event_to_follow", event="Neimark-Sacker point")]
 
 
 def _followed(
     model: Structure, curves: Sequence[ResponseCurve], kind: EventKind, parameter: str, to: float
 ) -> list[EventCurve]:
-    """The curves of an event through all that the responses have of it, each once."""
-    found: list[EventCurve] = []
+    """The curves through all events of one kind on the responses, each once."""
+    event_curves: list[EventCurve] = []
     for curve in curves:
-        begin = curve.force if parameter == FORCE else parameter_values(model)[parameter]
+        start = curve.force if parameter == FORCE else parameter_values(model)[parameter]
         for k in curve.at_events(kind):
             motion = curve.point(k)
-            known = [c for c in found if parameter == FORCE or c.force[0] == curve.force]
-            passed = [frequency for c in known for _, frequency in c.near(begin)]
+            known = [c for c in event_curves if parameter == FORCE or c.force[0] == curve.force]
+            passed = [frequency for c in known for _, frequency in c.near(start)]
             if np.any(np.abs(np.array(passed) / motion[1] - 1) < _SAME_EVENT):
                 continue
-            between = (min(begin, to), max(begin, to))
-            found.append(
+            between = (min(start, to), max(start, to))
+            event_curves.append(
                 follow_event(model, curve.force, motion, kind=kind, parameter=parameter, to=between)
             )
-    return found
+    return event_curves
 
 
 def simulate_mode(
@@ -233,7 +233,7 @@ def _notes_on_instability(branch: NormalModeBranch) -> Iterator[Fact]:
 
 
 def _most_moved(model: Structure, ends: tuple[float, float]) -> str:
-    """The sensor that sees most of the mode of interest, or of another that moves in a range."""
+    """The sensor with the largest shape of the mode of interest, or of one resonant in a range."""
     modes = model.modes
     (leading, *_) = [*resonant_modes(model, ends), modes.mode_of_interest]
     return modes.sensors[reference_sensor(dataclasses.replace(modes, mode_of_interest=leading))]
@@ -242,7 +242,7 @@ def _most_moved(model: Structure, ends: tuple[float, float]) -> str:
 def _notes_on_force(
     model: Structure, curves: Sequence[ResponseCurve], ends: tuple[float, float], isolated: bool
 ) -> Iterator[Fact]:
-    """Where no stable response to one force is known, and elements without effect."""
+    """Ranges without a known stable response to one force, and idle elements."""
     shown, unit = [c for c in curves if len(c.frequency)], model.modes.force_unit
     if not shown:
         return
@@ -268,7 +268,7 @@ def _notes_on_curve(curve: ResponseCurve, hold: Hold | None) -> Iterator[Fact]:
 
 
 def _notes_on_damping(model: Structure, ends: tuple[float, float]) -> Iterator[Fact]:
-    """Modes in a range whose damping the model does not know well."""
+    """Modes in a range with uncertain damping."""
     modes = model.modes
     for k in range(modes.n_modes):
         std, ratio = modes.damping_ratio_std.item(k), modes.damping_ratio.item(k)
@@ -278,12 +278,12 @@ def _notes_on_damping(model: Structure, ends: tuple[float, float]) -> Iterator[F
 
 
 def _notes_on_equilibria(model: Structure) -> tuple[Fact, ...]:
-    """That the structure has other equilibria than the one of the smallest displacement."""
-    found = equilibria(model)
-    if len(found) < 2:
+    """Note on equilibria other than the one of the smallest displacement."""
+    states = equilibria(model)
+    if len(states) < 2:
         return ()
     shape = np.asarray(model.modes.mode_shape)
-    rest, *places = (float((shape @ one.displacement)[0]) for one in found)  # m
-    stable = tuple(bool(other.stable) for other in found[1:])
+    rest, *others = (float((shape @ one.displacement)[0]) for one in states)  # m
+    stable = tuple(bool(other.stable) for other in states[1:])
     at = {"sensor": model.modes.sensors[0], "rest": rest}
-    return (Fact("further_equilibria", **at, displacement=tuple(places), stable=stable),)
+    return (Fact("further_equilibria", **at, displacement=tuple(others), stable=stable),)

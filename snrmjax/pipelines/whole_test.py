@@ -1,4 +1,4 @@
-"""A whole test: a folder of a laboratory's files to linear modes, check, backbone and diagnosis."""
+"""A whole test: from a laboratory's folder to linear modes, check, backbone and diagnosis."""
 
 import dataclasses
 import itertools
@@ -41,8 +41,8 @@ from snrmjax.pipelines.modes import LinearModesFound, ModalFit
 from snrmjax.pipelines.options import WholeTestOptions, checked
 from snrmjax.pipelines.predictions import Note
 
-_FEWEST_ALIKE = 3  # states of two files
-_ALIKE = 1e-5  # relative difference of frequency and velocity, below what repeated tests reach
+_FEWEST_ALIKE = 3  # equal states of two files
+_ALIKE = 1e-5  # relative difference of frequency and velocity, below test repeatability
 _TINY = 1e-300
 _MOTIONS = ("velocity", "acceleration", "displacement")
 
@@ -56,7 +56,7 @@ class SteppedRecord(NamedTuple):
 
 
 class WholeTest(NamedTuple):
-    """All that was found in the files of one test."""
+    """Results from the files of one test."""
 
     name: str
     files: TestFiles
@@ -64,17 +64,17 @@ class WholeTest(NamedTuple):
     modes: LinearModesFound | None  # None where the folder had a model
     records: tuple[tuple[str, RecordedTest], ...]  # by file
     stepped: tuple[SteppedRecord, ...]
-    counts: StepCounts | None  # of all steps; None where not all states are of steps
+    counts: StepCounts | None  # of all steps; None where not all states are from steps
     data: SteadyStates  # of all files
     checkup: Checkup
     identified: IdentifiedTest
     diagnosed: DiagnosedTest | None
-    left_out: tuple[Note, ...]  # why the diagnosis is left out
+    left_out: tuple[Note, ...]  # reasons for omitting the diagnosis
     notes: tuple[Note, ...]
 
     @property
     def folded(self) -> list[FoldedRecord | None]:
-        """The record of every state, folded; None of a table's."""
+        """The folded record of every state; None for states of tables."""
         of_steps = [each for record in self.stepped for each in record.folded]
         return [None] * (self.data.n_states - len(of_steps)) + of_steps
 
@@ -88,10 +88,10 @@ def run_whole_test(
 ) -> WholeTest:
     """Linear modes, steady states, check, backbone and diagnosis of the files in a folder.
 
-    Arguments: `options`, or its fields by keyword; `progress` is told each stage when it ends, with
-    its seconds.
-    Raises `ValueError`, as a question, where it would have to guess: which sensor is at the force,
-    or whether to go on in spite of what the check found; and as its stages do.
+    Arguments: `options`, or its fields by keyword; `progress` is called with each stage and its
+    seconds when it ends.
+    Raises `ValueError`, as a question, where the input is ambiguous: which sensor is at the force,
+    or whether to continue in spite of errors; and as its stages do.
     """
     options = checked(dataclasses.replace(options or WholeTestOptions(), **settings))
     folder = Path(folder)
@@ -102,7 +102,7 @@ def run_whole_test(
     model, modes = files.model, None
     if model is not None and options.base is not None:
         raise ValueError(
-            f"`--base` has no effect beside {files.model_file}, whose [base] says what the sensors "
+            f"`--base` has no effect with {files.model_file}, whose [base] states what the sensors "
             "record: leave it out."
         )
     if model is None:
@@ -119,8 +119,8 @@ def run_whole_test(
     parts = with_levels_apart([*tables, *(each.steps.states for each in stepped)])
     if not parts:
         raise ValueError(
-            f"{name} holds no steady states and no record of a stepped sine: the linear modes are "
-            "all that it tells, as `snrmjax modes` writes them."
+            f"{name} holds no steady states and no record of a stepped sine: it determines only "
+            "linear modes, as written by `snrmjax modes`."
         )
     _refuse_doubled([*(t.file for t in files.states), *(each.file for each in stepped)], parts)
     data = join_steady_states(parts)
@@ -152,23 +152,23 @@ def run_whole_test(
 
 
 class _Stages:
-    """Tells each stage with its seconds."""
+    """Report each stage with its seconds."""
 
     def __init__(self, progress: Callable[[str, float], None]) -> None:
         self.progress, self.began = progress, time.perf_counter()
 
     def ends(self, name: str) -> None:
-        """One stage ended, and the next one begins."""
+        """Report a stage that has ended."""
         now = time.perf_counter()
         self.progress(name, now - self.began)
         self.began = now
 
 
 def not_diagnosed(data: SteadyStates, model: Structure) -> tuple[Note, ...]:
-    """Why a test is not diagnosed: phases, units or scales are not those of the model's mode.
+    """Reasons against a diagnosis: phases, units or scales inconsistent with the model's mode.
 
-    The search would explain them by ever larger effects, which harmonic balance follows for many
-    minutes. A mode that is merely far from the linear one is diagnosed: effects may be why.
+    The search would fit them by ever larger effects, whose harmonic balance takes many minutes. A
+    mode that is only far from the linear one is diagnosed, as effects may cause it.
     """
     caveats = (*wrong_phases(data, model), *caveat(data, model))
     return (Fact("diagnosis_left_out", why=str(caveats[0])),) if caveats else ()
@@ -179,7 +179,7 @@ def _note_on_steps(record: SteppedRecord) -> Note:
 
 
 def _taken_sensors(files: TestFiles, model: Structure) -> tuple[Note, ...]:
-    """That files without a name of a sensor were taken for the model's only one."""
+    """Note on files without sensor name, which are assigned to the model's only sensor."""
     names = tuple(table.file for table in files.states if table.names_no_sensor)
     if not names or model.modes.sensors == UNNAMED_SENSOR:
         return ()
@@ -193,12 +193,12 @@ def _linear_modes(files: TestFiles, options: WholeTestOptions) -> LinearModesFou
         source = join_steady_states(with_levels_apart([table.states for table in files.states]))
     else:
         raise ValueError(
-            "what are the linear modes? The folder has time records only: put a model.toml or "
-            "frequency responses beside them."
+            "what are the linear modes? The folder has only time records: put a model.toml or "
+            "frequency responses into it."
         )
     fitted, notes = find_modes(source, base=options.base)  # type: ignore[arg-type]
     if options.base is not None:
-        # Of a base the product of shape and participation is known, and nothing else is needed.
+        # Base excitation determines the product of shape and participation, which suffices.
         scaled = scale_modes(fitted, None)
         scaled = dataclasses.replace(scaled, base=base_motion(options.base))
     else:
@@ -216,12 +216,12 @@ def _scaled(fitted: ModalFit, by: DrivePoint) -> ScaledModes:
             way = f"Name another sensor than {by.sensor}, or write"
         raise ValueError(
             f"how are the mode shapes scaled? {error} {way} the model by `snrmjax "
-            "modes`, which knows further ways, into this folder."
+            "modes`, which has further ways, into this folder."
         ) from error
 
 
 def _nearest_mode(scaled: ScaledModes, files: TestFiles) -> int:
-    """The mode at which the steady states are; the first where there are none."""
+    """The mode nearest to the steady states; the first where there are none."""
     if not files.states:
         return 0
     frequency = np.concatenate([np.asarray(table.states.frequency) for table in files.states])
@@ -235,13 +235,13 @@ def _sorted(named: NamedRecord, model: Structure) -> RecordedTest:
         if any(channel.quantity in _MOTIONS for channel in named.record.channels):
             raise
         raise ValueError(
-            f"{error} `snrmjax import {named.file}` says what the file holds and how to import it; "
+            f"{error} `snrmjax import {named.file}` lists its content and how to import it; "
             "put the map.toml that the import writes into the folder."
         ) from error
 
 
 def _refuse_doubled(names: Sequence[str], parts: Sequence[SteadyStates]) -> None:
-    """Raise `ValueError` where two files hold the same states: no repetition is that alike."""
+    """Raise `ValueError` where two files hold the same states, closer than any repetition."""
     for (a, one), (b, two) in itertools.combinations(zip(names, parts, strict=True), 2):
         first, second = (
             np.log([part.frequency, np.sum(np.abs(part.velocity), axis=1) + _TINY])
@@ -274,7 +274,7 @@ def _steps(named: NamedRecord, test: RecordedTest) -> SteppedRecord:
 
 
 def _used_steps(files: TestFiles, stepped: Sequence[SteppedRecord]) -> StepCounts | None:
-    """The counts of the records, or those of the import of all tables; None where not all are."""
+    """Step counts of the records, or of the imported tables; None if incomplete."""
     if stepped:
         return None if files.states else joined_counts([each.steps.counts for each in stepped])
     imported = files.steps_at_import
@@ -288,18 +288,18 @@ def _stop_at_errors(checkup: Checkup) -> None:
         return
     first, *others = errors
     more = "".join(
-        f" {'Besides,' if is_certain(first) and is_certain(other) else 'Or'} {other.evidence} "
+        f" {'In addition,' if is_certain(first) and is_certain(other) else 'Or'} {other.evidence} "
         f"{other.advice}"
         for other in others
     )
     raise ValueError(
-        f"is this meant? {first.name} in {first.where}: {first.evidence} To mend "
-        f"it: {first.advice}{more} To go on nevertheless: `--go-on`."
+        f"is this intended? {first.name} in {first.where}: {first.evidence} To correct "
+        f"it: {first.advice}{more} To continue nevertheless: `--go-on`."
     )
 
 
 def _without_outlying(data: SteadyStates, identified: IdentifiedTest) -> SteadyStates:
-    """The states without those that no curve of one mode explains: no effect does, either."""
+    """The states without outliers of the joint fit, which no effect on the mode explains."""
     far = outlying_states(identified.joint.fit) if identified.joint is not None else np.arange(0)
     if not far.size or 2 * far.size > data.n_states:
         return data
@@ -313,10 +313,10 @@ def _identified(data: SteadyStates, model: Structure) -> tuple[IdentifiedTest, t
     drive_only = not np.isfinite(np.asarray(data.force)).any()
     free = ("instrument_phase",) if drive_only else ()
     try:
-        found = identify_test(data, model, fit="auto", free=free)
-        if found.joint is not None and outlying_states(found.joint.fit).size:
-            found = identify_test(data, model, fit="auto", free=free, robust=True)
-        return found, ()
+        identified = identify_test(data, model, fit="auto", free=free)
+        if identified.joint is not None and outlying_states(identified.joint.fit).size:
+            identified = identify_test(data, model, fit="auto", free=free, robust=True)
+        return identified, ()
     except ValueError as error:
         if drive_only:
             raise

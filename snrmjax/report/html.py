@@ -1,4 +1,4 @@
-"""Reports: one HTML file that holds its figures, to be read on a screen, a phone or on paper."""
+"""Reports: one self-contained HTML file with its figures, for screen, phone or paper."""
 
 import base64
 import re
@@ -15,20 +15,20 @@ from snrmjax.report.style import COLUMN, PrintedFigure, printed
 
 Rows = Sequence[tuple[str, str]]
 
-PROGRAM = ("program", f"snrmjax {__version__}")  # among what was done
+PROGRAM = ("program", f"snrmjax {__version__}")  # among the inputs of a report
 
 _REM_PER_INCH = 8.0  # of figures on the page: their letters are then as large as the text's
 
 
 class LiveFigures(NamedTuple):
-    """Figures that answer to the mouse, as parts of a page."""
+    """Interactive figures, as parts of a page."""
 
     program: str  # what the page's head needs, the same for every page
-    body: str  # scripts and places of the figures
+    body: str  # scripts and containers of the figures
 
 
 class ReportFigure(NamedTuple):
-    """A figure, drawn already or not, with the words that explain how to read it."""
+    """A figure, rendered or not, with its caption."""
 
     figure: Figure | PrintedFigure
     caption: str
@@ -44,7 +44,7 @@ class ReportTable(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A part of a report: paragraphs, then live figures, then drawn ones, then tables."""
+    """A section of a report: paragraphs, then live figures, then printed ones, then tables."""
 
     heading: str
     text: Sequence[str] = ()
@@ -54,7 +54,7 @@ class Section(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What a report tells: title, inputs and result fit the first screen, the rest follows."""
+    """Content of a report: title, inputs and result fit the first screen, the rest follows."""
 
     title: str
     done: Rows = ()  # data, model and settings: name and value, in one line under the title
@@ -65,7 +65,7 @@ class Report(NamedTuple):
 
 
 def write_report(path: FilePath, report: Report) -> None:
-    """Write a report as one HTML file that needs nothing else, whole or not at all.
+    """Write a report as one self-contained HTML file, complete or not at all.
 
     Raises `ValueError` when `path` cannot be written.
     """
@@ -73,7 +73,7 @@ def write_report(path: FilePath, report: Report) -> None:
 
 
 def report_html(report: Report) -> str:
-    """A report as the text of one HTML file: figures inside, all words escaped."""
+    """A report as the text of one HTML file: figures embedded, all text escaped."""
     environment = Environment(
         loader=PackageLoader("snrmjax.report"),
         autoescape=True,

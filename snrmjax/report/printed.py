@@ -17,9 +17,9 @@ _LEFT = 'style="text-align: left"'
 
 
 def screen_of(shown: AbstractShown) -> str:
-    """A result on one screen: what it is, how much of it, ranges, statuses, notes."""
+    """A result on one screen: its class, dimensions, ranges, statuses and notes."""
     variables = shown.variables() if isinstance(shown, AbstractResult) else {}
-    ranges = [f"{what} {size}" if size else f"{what}: none" for what, size, _ in _ranges(variables)]
+    ranges = [f"{what} {span}" if span else f"{what}: none" for what, span, _ in _ranges(variables)]
     first, *others = _lines(shown, variables, ranges[:_LINES])
     return "\n".join([first, *(f"  {line}" for line in others)])
 
@@ -62,7 +62,7 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _lines(
     shown: AbstractShown, variables: Mapping[str, Variable], ranges: Iterable[str] = ()
 ) -> tuple[str, ...]:
-    """What a result says of itself; ranges are among it where it has no sentences of its own."""
+    """The lines that describe a result; with ranges where it has no summary of its own."""
     if hasattr(shown, "summary"):
         return shown.summary()
     return (_head(shown, variables), *_settings(shown), *ranges, *_ends(shown))
@@ -77,7 +77,7 @@ def _head(result: AbstractShown, variables: Mapping[str, Variable]) -> str:
 
 
 def _counted(size: int, dimension: str, variables: Mapping[str, Variable]) -> str:
-    """How many there are of what a dimension counts, or of the values of a quantity along it."""
+    """The number of items along a dimension, or of values of the quantity along it."""
     several = "" if size == 1 else "s"
     if dimension in variables and variables[dimension].unit not in ("", "1"):
         return f"{size} value{several} of {dimension}"
@@ -118,14 +118,14 @@ def _range(of: Variable, digits: int = 6) -> str:
     finite = values[np.isfinite(values)]
     if not finite.size:
         return ""
-    sizes = np.abs(finite) if values.dtype.kind == "c" else finite
-    low, high, unit = sizes.min(), sizes.max(), f" {unit_in_print(of.unit)}".rstrip()
+    magnitudes = np.abs(finite) if values.dtype.kind == "c" else finite
+    low, high, unit = magnitudes.min(), magnitudes.max(), f" {unit_in_print(of.unit)}".rstrip()
     ends = dict.fromkeys(f"{end:.{digits}g}" for end in (low, high))  # one where they are alike
     return f"{' to '.join(ends)}{unit}"
 
 
 def _ends(result: AbstractShown) -> Iterator[str]:
-    """Statuses with what they say, and notes."""
+    """Statuses with their messages, and notes."""
     for field in dataclasses.fields(result):
         value, about = getattr(result, field.name), field.metadata.get("quantity")
         if about is not None and about.of is not None:

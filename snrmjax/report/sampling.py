@@ -1,4 +1,4 @@
-"""What figures read off results: sampled curves, phasors and phases, in the figures' units."""
+"""Data of results for figures: sampled curves, phasors and phases, in the units of figures."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,7 +31,7 @@ class ShownAmplitude(NamedTuple):
     name: str  # "displacement"
     unit: str  # its base unit
     column: str  # how its columns in files end
-    power: int  # of the angular frequency, that turns a velocity into it
+    power: int  # of the angular frequency, by which a velocity is multiplied
 
     def of(self, velocity: ArrayLike, angular_frequency: ArrayLike) -> np.ndarray:
         """The amplitude of velocities (m/s) at these frequencies (rad/s)."""
@@ -102,7 +102,7 @@ def _in_units(values: "BackboneValues", beyond: np.ndarray) -> BackboneSamples:
 
 
 class FitResiduals(NamedTuple):
-    """What a joint fit leaves of its states, whitened: of unit variance if all is right."""
+    """Whitened residuals of a joint fit: of unit variance if model and noise are right."""
 
     level: np.ndarray  # counted from one
     velocity: np.ndarray  # m/s
@@ -113,7 +113,7 @@ class FitResiduals(NamedTuple):
 
 
 def fit_residuals(fit: "JointFit") -> FitResiduals:
-    """The residuals of a joint fit, with the place of their states."""
+    """The residuals of a joint fit, with amplitude, frequency and phase of their states."""
     velocity = np.asarray(fit.motion().velocity)
     sign = np.sign(float(fit.problem.modal_constant))
     return FitResiduals(
@@ -143,7 +143,7 @@ SHOWN_AMPLITUDES = {
     "displacement": ShownAmplitude("displacement", "m", "displacement_m", -1),
     "acceleration": ShownAmplitude("acceleration", "m/s²", "acceleration_m_s2", 1),
 }
-"""What figures may have as their amplitude, by name."""
+"""The amplitudes that figures can show, by name."""
 
 
 def usable_damping(
@@ -161,14 +161,14 @@ def phase_of(velocity: Any, backbone: "Backbone") -> np.ndarray:
 
 
 def sensor_index(sensors: tuple[str, ...], name: str) -> int:
-    """Place of a sensor among all, or a `ValueError` that names these."""
+    """Index of a sensor, or a `ValueError` that lists the sensors."""
     if name not in sensors:
         raise ValueError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
     return sensors.index(name)
 
 
 def span_of(curve: PredictedResponse | ResponseCurve, sensor: str) -> tuple[float, float]:
-    """Frequencies (rad/s) between which a response exceeds a quarter of its peak, and a margin."""
+    """Frequencies (rad/s) between which a response exceeds a quarter of its peak, with a margin."""
     amplitude = np.abs(velocity_of(curve, sensor))
     inside = curve.frequency[amplitude >= 0.25 * amplitude.max()]
     margin = 0.1 * np.ptp(inside)

@@ -1,4 +1,4 @@
-"""The marks, colours, panels and legends that all figures share.
+"""Markers, colours, panels and legends shared by all figures.
 
 Sizes are those of a printed page: a figure of `PAGE` inches fills its width, and no letter is
 smaller than 8 pt there. Everything is set on the figures themselves: matplotlib's settings stay
@@ -48,14 +48,14 @@ FILL: Style = {"alpha": 0.22, "linewidth": 0}
 
 
 class Unit(NamedTuple):
-    """A unit by its name and its size in the SI unit."""
+    """A unit by its name and its value in the SI unit."""
 
     size: float
     name: str
 
 
 def unit_for(values: Any, base: str) -> Unit:
-    """The unit in which the largest of values lies between 0.1 and 1000, where a prefix does that.
+    """The unit with the prefix that puts the largest value between 0.1 and 1000, where one does.
 
     >>> unit_for([0.02, 0.05], "m/s"), unit_for(1.166e-11, "N")
     (Unit(size=0.001, name='mm/s'), Unit(size=1.0, name='N'))
@@ -92,7 +92,7 @@ def png_bytes(figure: Figure, *, dots_per_inch: float = 220.0) -> bytes:
 
 
 class PrintedFigure(NamedTuple):
-    """A figure as the content of a PNG file, with its width on paper."""
+    """The content of a PNG file, with the width of the figure on paper."""
 
     png: bytes
     width: float  # inches
@@ -104,7 +104,7 @@ def printed(figure: Figure) -> PrintedFigure:
 
 
 def save_figure(path: FilePath, figure: Figure, *, dots_per_inch: float = 220.0) -> None:
-    """Write a figure as a PNG, whole or not at all.
+    """Write a figure as a PNG, completely or not at all.
 
     Raises `ValueError` when `path` does not end in .png or cannot be written.
     """
@@ -168,8 +168,8 @@ def fit_axis(axes: Axes, direction: str, points: Any, others: Any = (), bars: An
     outside = int(np.sum((value < ends[0]) | (value > ends[1])))
     if outside:
         note = f"{outside} point{'s' if outside > 1 else ''} outside the {direction} range"
-        place: Style = {"transform": axes.transAxes, "ha": "right", "va": "top", "fontsize": SMALL}
-        axes.text(0.99, 0.99 if direction == "y" else 0.93, note, color="0.3", **place)
+        corner: Style = {"transform": axes.transAxes, "ha": "right", "va": "top", "fontsize": SMALL}
+        axes.text(0.99, 0.99 if direction == "y" else 0.93, note, color="0.3", **corner)
 
 
 def phase_axis(axes: Axes) -> None:
@@ -223,7 +223,7 @@ def banded(
     strength: float = 1.0,
     **style: Any,
 ) -> None:
-    """A curve in the band of its errors, half as high as the band; None of both: the other alone.
+    """A curve with the band y ± error; without a band where `error` is None.
 
     Arguments: `name` and `band` in the legend; a curve without a style of its own is solid.
     """
@@ -287,17 +287,17 @@ def explain_lines(figure: Figure) -> None:
 
 
 def legend(figure: Figure) -> None:
-    """One legend below all panels, each name once in all its colours, to be read row by row."""
+    """One legend below all panels, each name once with all its colours, in reading order."""
     every: dict[str, dict[str, Any]] = {}
     for axes in figure.axes:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
             every.setdefault(name, {}).setdefault(_colour(handle), handle)
-    found: dict[str, Any] = {name: tuple(of.values()) for name, of in every.items()}
-    columns = _columns(list(found), figure.get_figwidth())
-    order = [k for first in range(columns) for k in range(first, len(found), columns)]
-    names = [list(found)[k] for k in order]
+    entries: dict[str, Any] = {name: tuple(of.values()) for name, of in every.items()}
+    columns = _columns(list(entries), figure.get_figwidth())
+    order = [k for first in range(columns) for k in range(first, len(entries), columns)]
+    names = [list(entries)[k] for k in order]
     figure.legend(
-        [found[name] for name in names],
+        [entries[name] for name in names],
         names,
         loc="outside lower center",
         ncols=columns,

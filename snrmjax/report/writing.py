@@ -1,4 +1,4 @@
-"""Results on file: `write_results`, and folders that are written whole or not at all."""
+"""Files of results: `write_results`, and folders that are written completely or not at all."""
 
 import importlib
 import os
@@ -29,11 +29,11 @@ _PAGES = {
 
 
 def page_of(result: object) -> ModuleType:
-    """The module that tells a pipeline's result: it has `write` and `headline`."""
+    """The page module of a pipeline's result, with `write` and `headline`."""
     name = _PAGES.get(type(result).__name__)
     if name is None:
         raise ValueError(
-            f"a `{type(result).__name__}` has no files; what pipelines return has: "
+            f"a `{type(result).__name__}` has no files; results of pipelines have: "
             f"{', '.join(_PAGES)}."
         )
     return importlib.import_module(f"snrmjax.report.pages.{name}")
@@ -85,6 +85,6 @@ def staged(out: Path) -> Iterator[Path]:
 
 
 def discard_unfinished() -> None:
-    """Remove what is staged and not yet in its place: for a process that ends at once."""
+    """Remove staged files that are not yet moved: for a process that ends at once."""
     while _unfinished:
         _unfinished.pop()()

@@ -1,4 +1,4 @@
-"""What a structure does under a force, and virtual tests of it."""
+"""Steady-state simulation of nonlinear structures, and virtual tests of them."""
 
 import lazy_loader
 

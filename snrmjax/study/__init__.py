@@ -4,13 +4,13 @@ A study is a TOML file (the how-to on studies has one), run on this machine by
 `snrmjax study run study.toml --out study.zarr` and drawn by
 `snrmjax study report study.zarr --out report`.
 
-On a batch queue, every task of an array computes its part on a shared folder, and the one that
-ends last makes the data set; a task that was killed is submitted again. With SLURM:
+On a batch queue, every task of an array computes its part on a shared folder, and the last one to
+end makes the data set; a task that was killed is submitted again. With SLURM:
 
     #SBATCH --array=1-20 --cpus-per-task=8 --time=2:00:00
     snrmjax study run study.toml --out study.zarr --shard $SLURM_ARRAY_TASK_ID/20
 
-Or with workers that Dask starts and stops (snrmjax[cluster] and dask-jobqueue):
+Or with workers managed by Dask (snrmjax[cluster] and dask-jobqueue):
 
     from dask_jobqueue import SLURMCluster
     import snrmjax as sj
@@ -21,7 +21,7 @@ Or with workers that Dask starts and stops (snrmjax[cluster] and dask-jobqueue):
     # Called again, it continues:
     sj.study.run_study(study, "study.zarr", scheduler=cluster.scheduler_address)
 
-Each worker needs the same versions and sees the same folders; it computes with one thread.
+Each worker needs the same versions and access to the same folders; it computes with one thread.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Computes the chunks of a study in processes that may die: local ones, or a Dask cluster's."""
+"""Compute the chunks of a study in processes that may die: local ones, or a Dask cluster's."""
 
 import copyreg
 import importlib
@@ -33,19 +33,19 @@ from snrmjax.study.study import Ensemble
 
 LOST = Failure(MemberStatus.LOST, "the process that computed it died")
 
-_DEATHS_BESIDE = 2  # of a chunk's worker, before the chunk is computed alone
-_TRIES_OF_ONE = 3  # of a member alone in a process, before it is given up
-_PATIENCE = "10s"  # with a scheduler that does not answer
+_DEATHS_IN_PARALLEL = 2  # of a chunk's worker before the chunk is computed alone
+_TRIES_OF_ONE = 3  # of a single member in a process, before it is stored as lost
+_PATIENCE = "10s"  # time-out for the scheduler's answer
 _ONE_THREAD = {
-    # Workers share the cores, and digits must not depend on how many there are.
+    # Workers share the cores, and results must not depend on the number of threads.
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
 }
 
-# lazy-loader 0.6 gives modules a class of its own, which pickles do not take for one of modules: a
-# user's function that names this package would not reach a worker.
+# lazy-loader 0.6 gives modules its own class, which pickle does not recognise as a module: without
+# this a user's function that refers to this package could not be sent to a worker.
 if type(snrmjax.model) is not ModuleType:
     copyreg.pickle(
         type(snrmjax.model), lambda module: (importlib.import_module, (module.__name__,))
@@ -53,18 +53,18 @@ if type(snrmjax.model) is not ModuleType:
 
 
 class WorkerDied(Exception):
-    """The process that computed something is gone."""
+    """The process of a task has died."""
 
 
 class ClusterGone(Exception):
-    """The cluster's scheduler cannot be reached, or is gone."""
+    """The cluster's scheduler cannot be reached."""
 
 
 class Workers:
-    """An executor that is started when it is needed, and anew after one of its processes died.
+    """An executor that is started on demand, and restarted after one of its processes died.
 
-    Arguments: `start` makes the executor; `width` is how many tasks it takes at a time; `stop` ends
-    it; of errors, `died` say that a task's process is gone, `gone` that the whole cluster is.
+    Arguments: `start` makes the executor; `width` is its number of parallel tasks; `stop` ends it;
+    the errors `died` mean that a task's process has died, `gone` that the cluster is lost.
     """
 
     def __init__(
@@ -90,11 +90,11 @@ class Workers:
             raise ClusterGone("the Dask scheduler is gone") from error
 
     def result(self, future: Future) -> Any:
-        """What a task returned. Raises `WorkerDied`, `ClusterGone` or what the task raised."""
+        """The result of a task. Raises `WorkerDied`, `ClusterGone` or the task's own error."""
         try:
             return future.result()
         except BrokenExecutor as error:
-            self.close()  # one death ends them all: the next task starts new ones
+            self.close()  # loky ends all processes after one death: the next task starts new ones
             raise WorkerDied(str(error)) from error
         except self._died as error:
             raise WorkerDied(str(error)) from error
@@ -109,18 +109,18 @@ class Workers:
 
 
 def local_processes(processes: int) -> Workers:
-    """Processes of this machine, each on a core of its own (loky: started anew, not forked)."""
+    """Processes of this machine, each on its own core (loky: spawned, not forked)."""
 
     def start() -> Executor:
         from loky import ProcessPoolExecutor
         from loky.backend import get_context
 
         context = get_context("loky")
-        # Without a thread of its own, which would still hold its locks when this process ends.
+        # A queue without a feeder thread, which would still hold its locks when this process ends.
         queue, cores = context.SimpleQueue(), available_cores()
         for k in range(processes):
             queue.put(cores[k % len(cores)])
-        # Compiled programs are kept where all of them find them.
+        # All processes use the same cache of compiled programs.
         cache = jax.config.values["jax_compilation_cache_dir"] or default_cache_folder()
         kept = {
             "JAX_COMPILATION_CACHE_DIR": str(cache),
@@ -132,7 +132,7 @@ def local_processes(processes: int) -> Workers:
             initializer=settle,
             initargs=(os.getpid(), queue, tuple(loaded_effects())),
             timeout=None,
-            # Each would take most of an accelerator's memory, on which responses are slow.
+            # Each process would allocate most of a GPU's memory, and responses are slow on a GPU.
             env={"JAX_PLATFORMS": "cpu", **_ONE_THREAD, **kept},
         )
 
@@ -142,7 +142,7 @@ def local_processes(processes: int) -> Workers:
 def dask_cluster(address: str) -> Workers:
     """The workers of a running Dask scheduler, such as that at tcp://node1:8786.
 
-    Raises `ValueError` without the package distributed, where nothing answers there, and with
+    Raises `ValueError` without the package distributed, where no scheduler answers, and with
     effects of a file, which its workers do not load.
     """
     if loaded_effects():
@@ -163,7 +163,9 @@ def dask_cluster(address: str) -> Workers:
     client_errors = (distributed.comm.CommClosedError, distributed.client.FutureCancelledError)
     return Workers(
         lambda: client.get_executor(pure=False),
-        max(2 * sum(client.nthreads().values()), 2),  # two tasks a thread, so that none waits
+        max(
+            2 * sum(client.nthreads().values()), 2
+        ),  # two tasks per thread, so that no thread is idle
         lambda executor: client.close(timeout=2),
         died=(distributed.KilledWorker,),
         gone=(CancelledError, *client_errors),
@@ -171,11 +173,11 @@ def dask_cluster(address: str) -> Workers:
 
 
 def settle(parent: int, cores: Any, effects: Sequence[Path] = ()) -> None:
-    """Before the first chunk: end with the process that started this one, and stay on one core.
+    """Initialise a worker: end it with its parent process, pin it to one core, load effects.
 
-    Arguments: `parent` is that process's number, `cores` a queue with a core for every worker,
-    to which this one's goes back when it ends: loky exchanges a worker that has grown for a new
-    one; `effects` are files with a user's own effects, which are loaded here too.
+    Arguments: `parent` is the parent's process id, `cores` a queue with a core for every worker,
+    to which a worker's core returns when it ends (loky replaces workers whose memory has grown);
+    `effects` are files with user-defined effects.
     """
 
     def watch() -> None:
@@ -183,7 +185,7 @@ def settle(parent: int, cores: Any, effects: Sequence[Path] = ()) -> None:
             time.sleep(0.2)
         os._exit(1)
 
-    # First of all: a parent that is killed now leaves nobody who would fill the queue.
+    # Before `cores.get`, which would wait for ever if the parent is killed now.
     threading.Thread(target=watch, daemon=True).start()
     core = cores.get()
     Finalize(None, cores.put, (core,), exitpriority=0)
@@ -194,21 +196,21 @@ def settle(parent: int, cores: Any, effects: Sequence[Path] = ()) -> None:
 
 
 def available_cores() -> list[int]:
-    """The cores that this process may use."""
+    """Cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
 
 
 class Receipt(NamedTuple):
-    """What is known of a chunk that was written."""
+    """Summary of a written chunk."""
 
     members: int
     failed: int
 
 
 def computed_rows(ensemble: Ensemble, numbers: range) -> dict[str, np.ndarray]:
-    """The rows of some members."""
+    """The result rows of some members."""
     os.environ.update({k: v for k, v in _ONE_THREAD.items() if k not in os.environ})
     with threadpool_limits(limits=1, user_api="blas"):
         return ensemble.rows(numbers)
@@ -229,11 +231,11 @@ def _stored(folder: StudyFolder, number: int, rows: dict[str, np.ndarray]) -> Re
 def receipts(
     ensemble: Ensemble, folder: StudyFolder, workers: Workers, numbers: Sequence[int]
 ) -> Iterator[Receipt]:
-    """Compute chunks and give their receipts in the order in which they are done.
+    """Compute chunks and yield their receipts in the order of completion.
 
-    The first chunk goes alone: it compiles for the others. A chunk whose process died twice beside
-    others is computed alone; if it dies there too, its members are, and one that keeps killing its
-    process is stored as lost. Raises what a task raised.
+    The first chunk is computed alone: it compiles for the others. A chunk whose process died twice
+    in parallel is computed alone; if it dies again, its members are computed singly, and a member
+    that keeps killing its process is stored as lost. Raises a task's own error.
     """
     pending, alone = deque(numbers), deque[int]()
     deaths: Counter[int] = Counter()
@@ -250,13 +252,13 @@ def receipts(
                 yield workers.result(future)
             except WorkerDied:
                 deaths[number] += 1
-                (pending if deaths[number] < _DEATHS_BESIDE else alone).append(number)
+                (pending if deaths[number] < _DEATHS_IN_PARALLEL else alone).append(number)
     for number in alone:
         yield _singly(ensemble, folder, workers, number)
 
 
 def _singly(ensemble: Ensemble, folder: StudyFolder, workers: Workers, number: int) -> Receipt:
-    """A chunk alone in the workers, and where its process dies its members."""
+    """A chunk computed alone, or its members singly if its process dies."""
     try:
         return workers.result(workers.submit(compute_chunk, ensemble, folder, number))
     except WorkerDied:
@@ -264,7 +266,7 @@ def _singly(ensemble: Ensemble, folder: StudyFolder, workers: Workers, number: i
 
 
 def _rescued(ensemble: Ensemble, workers: Workers, numbers: range) -> dict[str, np.ndarray]:
-    """Rows of members by halves; a member that kills its process has a status and nothing else."""
+    """Rows of members by bisection; a member that kills its process has only a status."""
     for _ in range(1 if len(numbers) > 1 else _TRIES_OF_ONE):
         try:
             return workers.result(workers.submit(computed_rows, ensemble, numbers))

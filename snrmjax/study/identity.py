@@ -1,4 +1,4 @@
-"""What a study is, in plain words and numbers: to recognise it, and to say what differs."""
+"""Description of a study as text and numbers, to identify it and to list differences."""
 
 import dataclasses
 import hashlib
@@ -16,20 +16,22 @@ from snrmjax.condense.beam_models import BeamModels
 from snrmjax.io.programs.effect_files import loaded_effects
 from snrmjax.study.study import Study
 
-_LONGEST = 64  # numbers of an array that are written out; longer ones are known by their hash
+_LONGEST = (
+    64  # entries of an array that are written out; longer arrays are identified by their hash
+)
 _PACKAGES = ("jax", "jaxlib", "numpy")
 
 
 def description(study: Study) -> dict[str, Any]:
-    """The study, its model and the versions behind it as plain text and numbers."""
-    # What is computed from a beam has other last digits on other machines: its file is the model.
-    made = ("members_a_chunk", *(("model",) if isinstance(study.model_of, BeamModels) else ()))
+    """The study, its model and the package versions as plain text and numbers."""
+    # A model condensed from a beam has other last digits on other machines: its file identifies it.
+    omitted = ("members_a_chunk", *(("model",) if isinstance(study.model_of, BeamModels) else ()))
     if study.sensor in (None, study.model.modes.sensors[0]):
-        made = (*made, "sensor")  # as studies are that were begun before they had one
+        omitted = (*omitted, "sensor")  # for stores older than this field
     parts = {
         field.name: _plain(getattr(study, field.name))
         for field in dataclasses.fields(study)
-        if field.name not in made
+        if field.name not in omitted
     }
     return {
         "study": {**parts, "members_a_chunk": study.chunk_size, **_own_effects()},
@@ -41,35 +43,35 @@ def description(study: Study) -> dict[str, Any]:
 
 
 def _own_effects() -> dict[str, Any]:
-    """Files whose effects members may have, known by what they hold; nothing without any."""
+    """Files of user-defined effects with their hashes; empty without any."""
     files = loaded_effects()
     return {"effects": {file.name: digest[:16] for file, digest in files.items()}} if files else {}
 
 
 def differences(here: Any, there: Any) -> dict[str, tuple[object, object]]:
-    """What two descriptions have at each place where they differ, in the order of the first."""
+    """Values of two descriptions by key where they differ, in the order of the first."""
     one, other = dict(_leaves(here)), dict(_leaves(there))
     both = {
-        place: (one.get(place, "absent"), other.get(place, "absent"))
-        for place in dict.fromkeys([*one, *other])
+        key_path: (one.get(key_path, "absent"), other.get(key_path, "absent"))
+        for key_path in dict.fromkeys([*one, *other])
     }
     return {
-        place.removeprefix("study."): (a, b)
-        for place, (a, b) in both.items()
+        key_path.removeprefix("study."): (a, b)
+        for key_path, (a, b) in both.items()
         if not (a == b or (a != a and b != b))
     }
 
 
-def _leaves(described: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    """Every number and text of a description, and its place."""
+def _leaves(described: Any, key_path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every number and text of a description, and its key path."""
     if isinstance(described, dict):
         for key, value in described.items():
-            yield from _leaves(value, f"{place}.{key}" if place else str(key))
+            yield from _leaves(value, f"{key_path}.{key}" if key_path else str(key))
     elif isinstance(described, list):
         for k, value in enumerate(described):
-            yield from _leaves(value, f"{place}[{k}]")
+            yield from _leaves(value, f"{key_path}[{k}]")
     else:
-        yield place, described
+        yield key_path, described
 
 
 def _plain(value: Any) -> Any:

@@ -1,6 +1,6 @@
-"""A study from its plan to its data set: run, continued after any stop, in shards or on a cluster.
+"""Run a study, or continue it after any stop, on this machine, in shards or on a cluster.
 
-An immutable plan, files that appear whole, and a data set made of them at the end.
+The plan is immutable, files are written atomically, and the data set is made of them at the end.
 """
 
 import os
@@ -35,26 +35,26 @@ from snrmjax.study.study import Ensemble, Study
 if TYPE_CHECKING:
     import xarray
 
-_SHOWN = 3  # differences that a refusal lists
+_SHOWN = 3  # differences listed in an error
 
 
 class Progress(NamedTuple):
-    """Where a run stands."""
+    """Progress of a run."""
 
     members: int
     done: int
     failed: int
     seconds: float  # since this run began
-    done_before: int  # members that were there when it began
+    done_before: int  # members that were complete at the start
 
     @property
     def per_second(self) -> float:
-        """Members computed a second."""
+        """Members computed per second."""
         return (self.done - self.done_before) / max(self.seconds, 1e-9)
 
     @property
     def seconds_left(self) -> float:
-        """At this pace."""
+        """Remaining time at the present rate."""
         return (self.members - self.done) / max(self.per_second, 1e-9)
 
 
@@ -62,19 +62,19 @@ ProgressReport = Callable[[Progress], None]
 
 
 class StudyRun(NamedTuple):
-    """How a run ended."""
+    """Summary of a run."""
 
     path: Path
     members: int
-    failed: int  # members without a result, of those that this run computed
-    computed: int  # members that this run computed
-    missing_chunks: int  # that other shards have still to compute
-    damaged_chunks: int  # that were found and computed again
+    failed: int  # members of this run without a result
+    computed: int  # members of this run
+    missing_chunks: int  # of other shards, still to be computed
+    damaged_chunks: int  # computed again
     seconds: float
 
     @property
     def complete(self) -> bool:
-        """Whether the data set is there."""
+        """Whether the data set exists."""
         return self.missing_chunks == 0
 
     def open(self) -> "xarray.Dataset":
@@ -83,7 +83,7 @@ class StudyRun(NamedTuple):
 
 
 def open_study(path: str | os.PathLike[str]) -> "xarray.Dataset":
-    """The data set of a study, its arrays read as they are used.
+    """The data set of a study, its arrays read on access.
 
     Returns an `xarray.Dataset` over `member` with the varied quantities as coordinates. Raises
     `ValueError` where there is none.
@@ -108,20 +108,19 @@ def run_study(
     progress: ProgressReport | None = None,
     workers: Workers | None = None,
 ) -> StudyRun:
-    """Compute a study and store it as one data set; the same call continues what was stopped.
+    """Compute a study and store it as one data set; the same call continues a stopped study.
 
     Chunks of members are computed by processes of this machine, each on one core, or by a Dask
-    cluster, and kept beside `out` in `out.parts`; when all are there they become `out`, a Zarr
-    store. Stopping at any moment loses chunks in flight only. Digits do not depend on how many
-    processes there are.
+    cluster, and kept in `out.parts`; the complete set becomes `out`, a Zarr store. Stopping loses
+    only the chunks in progress. Results do not depend on the number of processes.
 
     Arguments: `out` is the folder of the data set; `processes` of this machine (None: one for each
     core) or the address of a running Dask `scheduler`; `shard` (i, n) computes the i-th of n parts;
-    `progress` is called after each chunk; `workers` of your own in place of processes.
+    `progress` is called after each chunk; `workers` of your own replace processes.
     Returns a `StudyRun`. A member that fails is a row with its status.
     Raises `ValueError` before anything is written for a study that cannot be run, and for an `out`
-    that has another study, that another process is at work on, or that cannot be written;
-    `ClusterGone` where the scheduler ends: call again.
+    that holds another study, is in use by another process, or cannot be written; `ClusterGone`
+    where the scheduler is lost: call again.
     Not differentiable: derivatives by what varies: `snrmjax.study.response_quantities`.
     """
     if processes is not None and processes < 1:
@@ -137,9 +136,9 @@ def run_study(
     if is_collected(folder, described):
         return StudyRun(folder.out, len(ensemble.table), 0, 0, 0, 0, 0.0)
     if workers is None and scheduler is not None:
-        workers = dask_cluster(scheduler)  # one that is not there leaves nothing
+        workers = dask_cluster(scheduler)  # fails before anything is written
     workers = workers or local_processes(min(processes or len(available_cores()), study.n_chunks))
-    with closing(workers), _words_for_disk(folder), _locked(folder, shard):
+    with closing(workers), _disk_errors(folder), _locked(folder, shard):
         _claim(folder, described)
         whole, damaged = whole_chunks(folder, study.n_chunks)
         for chunk in damaged:
@@ -180,18 +179,18 @@ def _computed(
 
 
 def _claim(folder: StudyFolder, described: dict) -> None:
-    """Make the folder this study's, or see that it is."""
+    """Write the plan of this study into the folder, or check that it is the same."""
     known = read_study_plan(folder) or stored_description(folder)
     other = {} if known is None else differences(described, known)
     if other:
         each = [
-            f"`{place}` is {shown(here)} here and {shown(there)} in the store"
-            for place, (here, there) in list(other.items())[:_SHOWN]
+            f"`{key}` is {shown(here)} here and {shown(there)} in the store"
+            for key, (here, there) in list(other.items())[:_SHOWN]
         ]
         further = f" (and {len(other) - _SHOWN} more)" if len(other) > _SHOWN else ""
         raise ValueError(
-            f"{folder.out} has another study: {'; '.join(each)}{further}. Take another --out, or "
-            "go back to that study."
+            f"{folder.out} holds another study: {'; '.join(each)}{further}. Choose another --out, "
+            "or restore that study."
         )
     if not folder.plan.exists():
         write_study_plan(folder, described)
@@ -199,7 +198,7 @@ def _claim(folder: StudyFolder, described: dict) -> None:
 
 @contextmanager
 def _locked(folder: StudyFolder, shard: tuple[int, int]) -> Iterator[None]:
-    """Nobody else at work on the same study, or the same shard of it."""
+    """Lock the study, or the shard of it, against other processes."""
     from filelock import FileLock, Timeout
 
     made = not folder.work.exists()
@@ -220,12 +219,12 @@ def _locked(folder: StudyFolder, shard: tuple[int, int]) -> Iterator[None]:
 
 
 @contextmanager
-def _words_for_disk(folder: StudyFolder) -> Iterator[None]:
-    """An error of the disk in one sentence."""
+def _disk_errors(folder: StudyFolder) -> Iterator[None]:
+    """Report an error of the disk in one sentence."""
     try:
         yield
     except OSError as error:
         raise ValueError(
-            f"{folder.out} cannot be written: {error.strerror or error}. What is done stays; the "
-            "same command continues."
+            f"{folder.out} cannot be written: {error.strerror or error}. Completed chunks are "
+            "kept; the same command continues."
         ) from error

@@ -16,19 +16,19 @@ FEWEST_ROWS = 16  # of Saltelli's scheme
 
 
 class Sampling(eqx.Module):
-    """How the members are chosen.
+    """Sampling method of the members.
 
     "grid": every combination of the values; "list": the first value of each quantity, the second
-    of each, and so on; the others draw `members` of them from the distributions. "saltelli" draws
-    rows of a Sobol' sequence in pairs and exchanges one quantity after the other between them:
-    what `sobol_indices` asks for.
+    of each, and so on; the others draw `members` samples of the distributions. "saltelli" draws
+    rows of a Sobol' sequence in pairs and exchanges each quantity in turn between them, as
+    `sobol_indices` requires.
     """
 
     method: Method = eqx.field(static=True)
     members: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        """Raises `ValueError` for an unknown method and for numbers that make no sense."""
+        """Raises `ValueError` for an unknown method and for `members` below one."""
         if self.method not in get_args(Method):
             raise ValueError(f"`method` must be one of {', '.join(get_args(Method))}.")
         if self.members is not None and self.members < 1:
@@ -36,10 +36,9 @@ class Sampling(eqx.Module):
 
 
 def number_of_members(variations: Sequence[AbstractVariation], sampling: Sampling) -> int:
-    """How many members a study has, before any of them is drawn.
+    """Number of members of a study, before they are drawn.
 
-    Raises `ValueError` where that is not determined, contradicts itself or is more than a hundred
-    million.
+    Raises `ValueError` where it is not determined, contradictory or above a hundred million.
     """
     if sampling.method in ("grid", "list"):
         n = _counted_by_values(variations, sampling)
@@ -49,7 +48,7 @@ def number_of_members(variations: Sequence[AbstractVariation], sampling: Samplin
                 f"{sampling.members}: leave it out."
             )
     elif sampling.members is None:
-        raise ValueError(f"the method {sampling.method} needs `members`, how many to draw.")
+        raise ValueError(f"the method {sampling.method} needs `members`, the number of samples.")
     else:
         n = sampling.members
     if sampling.method == "saltelli":
@@ -66,23 +65,23 @@ def number_of_members(variations: Sequence[AbstractVariation], sampling: Samplin
 
 
 def _counted_by_values(variations: Sequence[AbstractVariation], sampling: Sampling) -> int:
-    sizes = {}
+    counts = {}
     for variation in variations:
         values = variation.grid()
         if values is None:
             raise ValueError(
-                f"a {sampling.method} goes through values, but {', '.join(variation.names)} has a "
+                f"a {sampling.method} needs values, but {', '.join(variation.names)} has a "
                 "distribution: give `values`, or a `range` with `points`, or another method."
             )
-        sizes[variation.names[0]] = len(values)
-    if not sizes:
+        counts[variation.names[0]] = len(values)
+    if not counts:
         raise ValueError(f"a {sampling.method} needs at least one quantity that varies.")
     if sampling.method == "grid":
-        return math.prod(sizes.values())
-    if len(set(sizes.values())) > 1:
-        each = ", ".join(f"{name} {n}" for name, n in sizes.items())
+        return math.prod(counts.values())
+    if len(set(counts.values())) > 1:
+        each = ", ".join(f"{name} {n}" for name, n in counts.items())
         raise ValueError(f"a list needs equally many values of each quantity, but has: {each}.")
-    return next(iter(sizes.values()))
+    return next(iter(counts.values()))
 
 
 def drawn_members(
@@ -91,8 +90,8 @@ def drawn_members(
     """The value of every varied quantity for every member, in the order of the variations.
 
     Draws by `scipy.stats.qmc`: Latin hypercube, scrambled Sobol' sequence (its first `members`
-    points), or independently. Saltelli's scheme has for every row a, b of a sequence the members
-    a, a with each quantity of b in turn (of several that vary together all), and b.
+    points), or independently. For every pair of rows a, b Saltelli's scheme has the members a, a
+    with each quantity of b in turn (jointly distributed ones together), and b.
     """
     n = number_of_members(variations, sampling)
     if sampling.method in ("grid", "list"):
@@ -103,18 +102,18 @@ def drawn_members(
     if not variations:
         return np.zeros((n, 0))
     unit = _unit_cube(sampling.method, n, [len(variation.names) for variation in variations], seed)
-    columns, begin = [], 0
+    columns, start = [], 0
     for variation in variations:
-        end = begin + len(variation.names)
-        columns.append(variation.quantiles(unit[:, begin:end]))
-        begin = end
+        end = start + len(variation.names)
+        columns.append(variation.quantiles(unit[:, start:end]))
+        start = end
     return np.concatenate(columns, axis=1)
 
 
 def _unit_cube(
     method: Method, n: int, groups: Sequence[int], seed: int
 ) -> Float[np.ndarray, "member name"]:
-    """Points of the unit cube; `groups` are how many quantities each variation has."""
+    """Points of the unit cube; `groups` are the numbers of quantities per variation."""
     from scipy.stats import qmc
 
     width = sum(groups)
@@ -123,17 +122,17 @@ def _unit_cube(
     if method == "saltelli":
         pairs = qmc.Sobol(2 * width, rng=random).random(n // (len(groups) + 2))
         one, other = pairs[:, None, :width], pairs[:, None, width:]
-        taken = np.repeat(np.eye(len(groups), dtype=bool), groups, axis=1)
-        mixed = np.where(taken, other, one)
-        return np.concatenate([one, mixed, other], axis=1).reshape(n, width)
+        swapped = np.repeat(np.eye(len(groups), dtype=bool), groups, axis=1)
+        exchanged = np.where(swapped, other, one)
+        return np.concatenate([one, exchanged, other], axis=1).reshape(n, width)
     if method == "latin_hypercube":
         return qmc.LatinHypercube(width, rng=random).random(n)
     if method == "sobol":
-        # A whole power of two, as the sequence wants it; its first points are the members.
+        # A Sobol' sequence is balanced for powers of two; its first n points are the members.
         return qmc.Sobol(width, rng=random).random_base2((n - 1).bit_length())[:n]
     return random.random((n, width))
 
 
 def member_seed(seed: int, member: int) -> int:
-    """The seed of a member's own noise: of the study's seed and its number alone."""
+    """The seed of a member's noise, from the study's seed and the member's number only."""
     return int(np.random.SeedSequence(seed, spawn_key=(member,)).generate_state(1)[0])

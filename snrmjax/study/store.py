@@ -1,7 +1,7 @@
 """A study on disk: its plan, the chunks of its members, and the data set that is made of them.
 
-Beside the data set `study.zarr` lies `study.zarr.parts` with `plan.json`, which says what the study
-is, and a file a chunk. Every file takes its name when it is whole.
+Next to the data set `study.zarr` is `study.zarr.parts` with `plan.json`, the description of the
+study, and one file per chunk. Every file is renamed to its final name when complete.
 """
 
 import hashlib
@@ -22,15 +22,15 @@ from snrmjax.study.computations.base import MEMBER, TEXT, Output, joined
 from snrmjax.study.identity import differences
 from snrmjax.study.study import FORCE, Ensemble
 
-_BLOCK = 1 << 16  # rows of a ragged variable that are one file
-_TARGET = 1 << 20  # numbers that one file of a member's variable holds at most
-_TOGETHER = 1 << 25  # bytes of chunks that are written together
+_BLOCK = 1 << 16  # rows of a ragged variable per file
+_TARGET = 1 << 20  # most numbers of a member's variable per file
+_TOGETHER = 1 << 25  # bytes of chunks written at once
 _DIGEST = "collected.txt"
 _UNITS = {"natural_frequency": "rad/s", "frequency_hz": "Hz", FORCE: "N"}
 
 
 class StudyFolder(NamedTuple):
-    """Where a study is kept: the data set `out`, and beside it the chunks it is made of."""
+    """Folder of a study: the data set `out`, and next to it its chunks."""
 
     out: Path
 
@@ -41,7 +41,7 @@ class StudyFolder(NamedTuple):
 
     @property
     def plan(self) -> Path:
-        """What the study is."""
+        """The file with the description of the study."""
         return self.work / "plan.json"
 
     @property
@@ -55,13 +55,13 @@ class StudyFolder(NamedTuple):
 
 
 def write_study_plan(folder: StudyFolder, described: Mapping[str, object]) -> None:
-    """Write what the study is beside its chunks, once."""
+    """Write the description of the study next to its chunks."""
     folder.chunks.mkdir(parents=True, exist_ok=True)
     write_atomically(folder.plan, json.dumps(described, indent=1, sort_keys=True) + "\n")
 
 
 def read_study_plan(folder: StudyFolder) -> dict[str, Any] | None:
-    """What the study that is kept there is; None where there is none.
+    """The description of the study in a folder; None where there is none.
 
     Raises `ValueError` where the plan cannot be read.
     """
@@ -78,7 +78,7 @@ def read_study_plan(folder: StudyFolder) -> dict[str, Any] | None:
 def write_chunk(folder: StudyFolder, number: int, rows: Mapping[str, np.ndarray]) -> None:
     """Write the rows of a chunk.
 
-    Raises `OSError` where it cannot be written; nothing is left behind then.
+    Raises `OSError` where it cannot be written, without leaving a file.
     """
     temporary = folder.chunks / f".{uuid.uuid4().hex}.tmp"
     try:
@@ -90,7 +90,7 @@ def write_chunk(folder: StudyFolder, number: int, rows: Mapping[str, np.ndarray]
 
 
 def whole_chunks(folder: StudyFolder, n_chunks: int) -> tuple[list[int], list[Path]]:
-    """The numbers of the chunks that are there and whole, and files that are not."""
+    """Numbers of the complete chunks, and damaged files."""
     numbers = [k for k in range(n_chunks) if folder.chunk(k).exists()]
     damaged = [k for k in numbers if not _is_whole(folder.chunk(k))]
     return sorted({*numbers} - {*damaged}), [folder.chunk(k) for k in damaged]
@@ -110,7 +110,7 @@ def _read_chunk(path: Path) -> dict[str, np.ndarray]:
 
 
 def stored_description(folder: StudyFolder) -> dict[str, Any] | None:
-    """What the study of a data set is; None where there is none. Raises `ValueError` if foreign."""
+    """The description of a data set's study, or None. Raises `ValueError` for other data."""
     if not folder.out.exists():
         return None
     try:
@@ -123,25 +123,25 @@ def stored_description(folder: StudyFolder) -> dict[str, Any] | None:
 
 
 def is_collected(folder: StudyFolder, described: Mapping[str, Any]) -> bool:
-    """Whether the data set is there, of this study, and as it was written."""
+    """Whether the data set exists, belongs to this study and is unchanged."""
     stored = stored_description(folder)
     if stored is None or differences(described, stored):
         return False
     known = folder.work / _DIGEST
-    if not known.exists():  # the chunks were cleared away: the data set stands alone
+    if not known.exists():  # the parts were removed: only the data set is left
         return not folder.chunks.exists()
     return known.read_text(encoding="utf-8") == _digest(folder.out)
 
 
 def collect_chunks(ensemble: Ensemble, folder: StudyFolder, described: Mapping[str, Any]) -> None:
-    """Write the data set of all chunks; it appears whole or not at all.
+    """Write the data set of all chunks, atomically.
 
     Memory is bounded by a few chunks. Raises `OSError` on a full disk.
     """
     from filelock import FileLock
 
     building = folder.work / "collecting.zarr"
-    with FileLock(folder.work / ".collecting"):  # of shards that end at once one is enough
+    with FileLock(folder.work / ".collecting"):  # of simultaneous shards only one collects
         if is_collected(folder, described):
             return
         shutil.rmtree(building, ignore_errors=True)
@@ -154,12 +154,12 @@ def collect_chunks(ensemble: Ensemble, folder: StudyFolder, described: Mapping[s
         finally:
             shutil.rmtree(building, ignore_errors=True)
         write_atomically(folder.work / _DIGEST, digest)
-    for leftover in folder.chunks.glob(".*.tmp"):  # of writers that were stopped
+    for leftover in folder.chunks.glob(".*.tmp"):  # of stopped writers
         leftover.unlink(missing_ok=True)
 
 
 def _digest(store: Path) -> str:
-    """What the files of a data set are known by."""
+    """Hash of the files of a data set."""
     digest = hashlib.sha256()
     for path in sorted(path for path in store.rglob("*") if path.is_file()):
         digest.update(path.relative_to(store).as_posix().encode() + path.read_bytes())
@@ -187,25 +187,25 @@ def _write_store(
         counted = outputs[f"n_{dimension}s"].dimensions
         outputs[f"first_{dimension}"] = Output(counted, "i8", "1", text)
     chunks = [folder.chunk(k) for k in range(study.n_chunks)]
-    widest, totals = _first_look(chunks, outputs, ragged)
+    widest, totals = _widths_and_totals(chunks, outputs, ragged)
     arrays = {}
     for name, one in outputs.items():
         shape = tuple({**sizes, **totals}[d] for d in one.dimensions)
         dtype = f"<U{widest[name]}" if one.kind == TEXT else one.kind
         block = _BLOCK if one.dimensions[0] in ragged else _member_block(study.chunk_size, shape)
         arrays[name] = _array(group, name, one, shape, dtype, block)
-    begin = dict.fromkeys((MEMBER, *ragged), 0)
+    start = dict.fromkeys((MEMBER, *ragged), 0)
     for rows in _together(chunks):
         for dimension in ragged:
             count = rows[f"n_{dimension}s"]
-            ends = begin[dimension] + np.cumsum(count.ravel(), dtype=np.int64)
+            ends = start[dimension] + np.cumsum(count.ravel(), dtype=np.int64)
             rows[f"first_{dimension}"] = ends.reshape(count.shape) - count
         written = {}
         for name, array in arrays.items():
             dimension = outputs[name].dimensions[0]
-            written[dimension] = begin[dimension] + len(rows[name])
-            array[begin[dimension] : written[dimension]] = rows[name].astype(array.dtype)
-        begin = written
+            written[dimension] = start[dimension] + len(rows[name])
+            array[start[dimension] : written[dimension]] = rows[name].astype(array.dtype)
+        start = written
     group.attrs.update(
         {
             "coordinates": " ".join(study.names),
@@ -219,10 +219,10 @@ def _write_store(
     zarr.consolidate_metadata(path, zarr_format=2)
 
 
-def _first_look(
+def _widths_and_totals(
     chunks: Iterable[Path], outputs: Mapping[str, Output], ragged: Iterable[str]
 ) -> tuple[dict[str, int], dict[str, int]]:
-    """The longest text of every variable of text, and how many rows each ragged dimension has."""
+    """Longest text of every text variable, and number of rows of each ragged dimension."""
     widest = {name: 1 for name, one in outputs.items() if one.kind == TEXT}
     totals = dict.fromkeys(ragged, 0)
     for chunk in chunks:
@@ -235,7 +235,7 @@ def _first_look(
 
 
 def _together(chunks: Iterable[Path]) -> Iterator[dict[str, np.ndarray]]:
-    """The rows of the chunks in order, of several at once where they are small."""
+    """The rows of the chunks in order, several small chunks at once."""
     waiting: list[dict[str, np.ndarray]] = []
     for chunk in chunks:
         waiting.append(_read_chunk(chunk))
@@ -247,7 +247,7 @@ def _together(chunks: Iterable[Path]) -> Iterator[dict[str, np.ndarray]]:
 
 
 def _write_labels(group: Any, ensemble: Ensemble) -> None:
-    """Coordinates: the varied quantities, and the axes that all members share."""
+    """Coordinates: the varied quantities, and the axes common to all members."""
     labels = {}
     for name, column in zip(ensemble.study.names, ensemble.table.T, strict=True):
         unit = next((u for end, u in _UNITS.items() if name.endswith(end)), "")
@@ -259,7 +259,7 @@ def _write_labels(group: Any, ensemble: Ensemble) -> None:
 
 
 def _member_block(chunk: int, shape: Sequence[int]) -> int:
-    """Members that one file of the data set holds: whole chunks of the study."""
+    """Members per file of the data set: a multiple of the study's chunk."""
     return chunk * max(_TARGET // (chunk * int(np.prod(shape[1:], dtype=int)) or 1), 1)
 
 
@@ -273,7 +273,7 @@ def _array(
         shape=shape,
         chunks=(max(min(block, shape[0]), 1), *(max(n, 1) for n in shape[1:])),
         dtype=np.dtype(dtype),
-        # With a checksum: a file that is damaged is not read as numbers.
+        # The checksum detects damaged files.
         compressors=Zstd(level=3, checksum=True),
         fill_value=np.nan if one.kind == "f8" else None,
         attributes={

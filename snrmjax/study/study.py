@@ -1,4 +1,4 @@
-"""A study: one model, what varies, what is computed; checked before anything runs."""
+"""A study: one model, varied quantities and a computation, checked before it runs."""
 
 import dataclasses
 import difflib
@@ -36,21 +36,21 @@ from snrmjax.study.computations.base import (
 from snrmjax.study.sampling import Sampling, drawn_members, member_seed, number_of_members
 from snrmjax.study.variations import AbstractVariation
 
-_IN_HERTZ = ".frequency_hz"  # beside `natural_frequency` in rad/s, as model files have it
-_STRANGE = 3.0  # times the model's frequency, beyond which a value is taken for another unit's
+_IN_HERTZ = ".frequency_hz"  # alternative to `natural_frequency` in rad/s, as in model files
+_STRANGE = 3.0  # ratio to the model's frequency above which a unit error is assumed
 
 
 class Study(eqx.Module):
-    """Many members of one model and what is computed for each.
+    """Many members of one model and the computation for each.
 
-    `variations` name numbers of the model as `parameter_names` does ("mode_1.damping_ratio";
+    `variations` have names of model parameters as in `parameter_names` ("mode_1.damping_ratio";
     natural frequencies in rad/s, or as "mode_1.frequency_hz" in Hz), and `force_n`. With
-    `model_of`, a function of the varied values by name, they may name anything: it makes the
-    model of a member, and where it raises `ValueError` the member has a status that says so.
-    `BeamModels` make it from the numbers of a beam file ("section.thickness_m"), beside those of
-    the model. `members_a_chunk` is how many are computed and stored together. Peaks and velocities
-    are those of `sensor`, by default the model's first; what identifies a test has them where the
-    mode of interest moves most.
+    `model_of`, a function of the varied values by name, other names are possible: it makes the
+    model of a member, and its `ValueError` becomes the member's status. `BeamModels` make it from
+    the numbers of a beam file ("section.thickness_m") and those of the model. `members_a_chunk`
+    is the number computed and stored together. Peaks and velocities are those of `sensor`, by
+    default the model's first; virtual tests, identifications and diagnoses use the sensor with
+    the largest shape of the mode of interest.
     """
 
     name: str = eqx.field(static=True)
@@ -70,35 +70,35 @@ class Study(eqx.Module):
 
     @property
     def n_members(self) -> int:
-        """How many members there are."""
+        """Number of members."""
         return number_of_members(self.variations, self.sampling)
 
     @property
     def sensor_told(self) -> str | None:
-        """The sensor of peaks and velocities; None where nothing is told of one.
+        """The sensor of peaks and velocities; None where no output refers to one.
 
         Raises `ValueError` for a `sensor` that the model does not have.
         """
-        return self.computation.sensor(_seen(self.model, self.sensor).modes)
+        return self.computation.sensor(_with_sensor(self.model, self.sensor).modes)
 
     @property
     def chunk_size(self) -> int:
-        """How many members are computed and stored together."""
+        """Number of members computed and stored together."""
         if self.members_a_chunk is None:
             return self.computation.members_a_chunk
         return self.members_a_chunk
 
     @property
     def n_chunks(self) -> int:
-        """How many chunks there are."""
+        """Number of chunks."""
         return -(-self.n_members // self.chunk_size)
 
     def ensemble(self) -> "Ensemble":
         """The members, drawn and checked.
 
         Raises `ValueError` for a quantity that the model does not have or that varies twice, for a
-        missing force or a needless one, for a `sensor` that the model does not have or of which
-        nothing is told, for too many members, and for the first value that the model cannot have.
+        missing or superfluous force, for a `sensor` that the model does not have or the outputs do
+        not use, for too many members, and for the first inadmissible value.
         """
         if self.seed < 0:
             raise ValueError(f"`seed` must be zero or positive, but is {self.seed}.")
@@ -121,31 +121,31 @@ class Ensemble(NamedTuple):
 
     def rows_of(self, chunk: int) -> range:
         """The numbers of the members of a chunk."""
-        size = self.study.chunk_size
-        return range(chunk * size, min((chunk + 1) * size, len(self.table)))
+        n = self.study.chunk_size
+        return range(chunk * n, min((chunk + 1) * n, len(self.table)))
 
     def rows(self, numbers: Sequence[int]) -> dict[str, np.ndarray]:
-        """The outputs of some members; one without a model has its status and nothing else."""
+        """The outputs of some members; one without a model has only its status."""
         study, rows = self.study, self.table[list(numbers)]
         models = models_of(study, rows)
-        there = [k for k, model in enumerate(models) if isinstance(model, Structure)]
+        solvable = [k for k, model in enumerate(models) if isinstance(model, Structure)]
         missing = {k: model for k, model in enumerate(models) if isinstance(model, Failure)}
-        forces = rows[there][:, [study.names.index(FORCE)]] if FORCE in study.names else None
-        seeds = [member_seed(study.seed, numbers[k]) for k in there]
-        members = Members([models[k] for k in there], forces, seeds)  # type: ignore[misc]
-        outputs = study.computation.rows(members) if there else None
+        forces = rows[solvable][:, [study.names.index(FORCE)]] if FORCE in study.names else None
+        seeds = [member_seed(study.seed, numbers[k]) for k in solvable]
+        members = Members([models[k] for k in solvable], forces, seeds)  # type: ignore[misc]
+        outputs = study.computation.rows(members) if solvable else None
         if outputs and not missing:
             return outputs
         return with_refused(study.computation, outputs, missing)
 
 
 def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Structure | Failure]:
-    """The models of members with these values of the varied quantities, or why there is none."""
+    """The models of members for these values of the varied quantities, or their failures."""
     named = [k for k, name in enumerate(study.names) if name != FORCE]
     if study.model_of is not None:
         each = [dict(zip(study.names, row, strict=True)) for row in rows.tolist()]
         return [_made(study.model_of, values, study.sensor) for values in each]
-    model = _seen(study.model, study.sensor)
+    model = _with_sensor(study.model, study.sensor)
     if not named:
         return [model] * len(rows)
     names, units = zip(*(_in_model(study.names[k]) for k in named), strict=True)
@@ -162,13 +162,13 @@ def _made(
         named = {_in_model(name): value for name, value in values.items()}
         values = {name: value * unit for (name, unit), value in named.items()}
     try:
-        return _seen(model_of(values), sensor)
+        return _with_sensor(model_of(values), sensor)
     except ValueError as error:
         return refusal(error)
 
 
-def _seen(model: Structure, sensor: str | None) -> Structure:
-    """The model with this sensor as its first, of which peaks and velocities are told."""
+def _with_sensor(model: Structure, sensor: str | None) -> Structure:
+    """The model with this sensor as its first, which peaks and velocities refer to."""
     if sensor in (None, model.modes.sensors[0]):
         return model
     return dataclasses.replace(model, modes=model.modes.with_first_sensor(str(sensor)))
@@ -183,7 +183,7 @@ def _varied(model: Structure, names: tuple[str, ...], values: Array) -> Structur
 
 
 def _in_model(name: str) -> tuple[str, float]:
-    """The model's name of a quantity, and what to multiply its values with."""
+    """The model's name of a quantity, and the factor for its values."""
     if name.endswith(_IN_HERTZ):
         return f"{name.removesuffix(_IN_HERTZ)}.natural_frequency", HERTZ
     return name, 1.0
@@ -222,12 +222,12 @@ def _check_names(study: Study) -> None:
 
 
 def _check_sensor(study: Study) -> None:
-    asked, told = study.sensor, study.sensor_told
-    if asked not in (None, told):
+    requested, used = study.sensor, study.sensor_told
+    if requested not in (None, used):
         kind = study.computation.kind
-        instead = f"tells of {told}, where the mode of interest moves most"
+        instead = f"uses {used}, where the mode of interest moves most"
         raise ValueError(
-            f"`sensor` cannot be {asked}: {kind} {instead if told else 'tells of no sensor'}."
+            f"`sensor` cannot be {requested}: {kind} {instead if used else 'uses no sensor'}."
         )
 
 
@@ -254,12 +254,12 @@ def _rules(study: Study, name: str) -> tuple[Rule, ...]:
 
 
 def _of_model(study: Study) -> bool:
-    """Whether names that are no beam's are the model's."""
+    """Whether names other than a beam's are parameters of the model."""
     return study.model_of is None or isinstance(study.model_of, BeamModels)
 
 
 def _check_unit(study: Study, name: str, values: np.ndarray) -> None:
-    """Refuse natural frequencies in Hz where rad/s are expected, and the other way round."""
+    """Refuse natural frequencies in Hz where rad/s are expected, and vice versa."""
     in_model, unit = _in_model(name)
     if not _of_model(study) or not in_model.endswith(".natural_frequency"):
         return

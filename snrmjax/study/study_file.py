@@ -34,7 +34,7 @@ from snrmjax.study.variations import (
 _METHODS = get_args(Method)
 _RANGE = ("from_hz", "to_hz")
 _ERRORS = ("amplitude", "phase_deg", "force", "level_gain", "level_phase_deg")
-# Keys that each kind of computation needs and may have, beside those of every study.
+# Required and optional keys of each kind of computation, in addition to those of every study.
 _KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "peaks": (_RANGE, ("forces_n", "harmonics", "stability", "grid_points", "sensor")),
     "curves": (_RANGE, ("forces_n", "harmonics", "stability", "sensor")),
@@ -48,12 +48,12 @@ _EVERY = ("vary", "sample", "seed", "name", "members_a_chunk")
 
 
 def read_study(path: FilePath) -> Study:
-    """Read a study from a TOML: its model, what varies and what is computed.
+    """Read a study from a TOML: model, varied quantities and computation.
 
-    The model's path (and that of data) is relative to the study's folder. It may be that of a beam
-    file: every member is then condensed from the finite elements of its own beam.
-    Returns the study. Raises `ValueError` that names file, table, key, value and what was expected;
-    the members are drawn and checked too.
+    The model's path (and that of data) is relative to the study's folder. It may be a beam file:
+    every member is then condensed from the finite elements of its own beam.
+    Returns the study. Raises `ValueError` with file, table, key, value and the expected value; the
+    members are drawn and checked too.
     """
     file = file_name(path)
     top = parsed_toml(read_text(path), file)
@@ -61,7 +61,7 @@ def read_study(path: FilePath) -> Study:
     if kind is None:
         raise ValueError(f"{file} lacks the key `compute`, one of {', '.join(_KEYS)}.")
     needed, possible = _KEYS[kind]
-    # A key that another computation has is a mistake worth its own words.
+    # Also refuses a key of another computation.
     top.check_keys(("model", "compute", *needed), (*possible, *_EVERY))
     folder = Path(path).parent
     path_of_model = folder / top.text("model")
@@ -99,18 +99,18 @@ def _variation(table: TomlTable) -> AbstractVariation:
     if "parameters" in table.entries:
         return _joint(table)
     if "parameter" not in table.entries:
-        raise ValueError(f"{table.place} lacks the key `parameter`.")
+        raise ValueError(f"{table.location} lacks the key `parameter`.")
     return _single(table)
 
 
 def _made(
     table: TomlTable, kind: Callable[..., AbstractVariation], *arguments: Any
 ) -> AbstractVariation:
-    """A variation; what it refuses is refused with the table's place."""
+    """A variation; its errors are reported with the table's location."""
     try:
         return kind(*arguments)
     except ValueError as error:
-        raise ValueError(f"{table.place} cannot be read: {error}") from error
+        raise ValueError(f"{table.location} cannot be read: {error}") from error
 
 
 def _single(table: TomlTable) -> AbstractVariation:
@@ -119,7 +119,7 @@ def _single(table: TomlTable) -> AbstractVariation:
     if len(ways) != 1:
         given = " and ".join(f"`{key}`" for key in ways) or "none of them"
         raise ValueError(
-            f"{table.place} ({name[0]}) needs one of `values`, `range`, `distribution`, but has "
+            f"{table.location} ({name[0]}) needs one of `values`, `range`, `distribution`, but has "
             f"{given}."
         )
     if ways == ["values"]:
@@ -148,7 +148,7 @@ def _joint(table: TomlTable) -> AbstractVariation:
     if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
         raise table.refusal("covariance", "a list of rows", rows)
     each = [
-        TomlTable({"covariance": row}, f"{table.place}, row {k + 1},").numbers(
+        TomlTable({"covariance": row}, f"{table.location}, row {k + 1},").numbers(
             "covariance", each="entry"
         )
         for k, row in enumerate(rows)
@@ -177,7 +177,7 @@ def _computation(
     ends = [top.number(key, POSITIVE) for key in _RANGE]
     if not ends[0] < ends[1]:
         raise ValueError(
-            f"`from_hz` must be below `to_hz`, but {top.place} has {ends[0]:g} and {ends[1]:g}."
+            f"`from_hz` must be below `to_hz`, but {top.location} has {ends[0]:g} and {ends[1]:g}."
         )
     within = ResponseRange(
         ends[0] * HERTZ, ends[1] * HERTZ, harmonics, _flag(top, "stability", True)
@@ -187,7 +187,7 @@ def _computation(
     if forces is None and not varied and model.modes.unbalance is not None:
         forces = np.ones(1)
     if forces is None and not varied:
-        raise ValueError(f"{top.place} lacks the key `forces_n`, and {FORCE} does not vary.")
+        raise ValueError(f"{top.location} lacks the key `forces_n`, and {FORCE} does not vary.")
     if kind == "virtual_test":
         levels = np.zeros(0) if forces is None else forces
         per_level = top.whole("points_per_level", 1, 5)
@@ -207,15 +207,15 @@ def _forces(top: TomlTable) -> np.ndarray | None:
 
 
 def _errors(top: TomlTable) -> MeasurementErrors:
-    table = top.table("errors", f"[errors] of {top.place}")
+    table = top.table("errors", f"[errors] of {top.location}")
     table.check_keys((), _ERRORS)
-    sizes = {key: table.number(key, NOT_NEGATIVE, default=0.0) for key in _ERRORS}
+    stds = {key: table.number(key, NOT_NEGATIVE, default=0.0) for key in _ERRORS}
     return MeasurementErrors(
-        sizes["amplitude"],
-        sizes["phase_deg"] * DEGREE,
-        sizes["force"],
-        sizes["level_gain"],
-        sizes["level_phase_deg"] * DEGREE,
+        stds["amplitude"],
+        stds["phase_deg"] * DEGREE,
+        stds["force"],
+        stds["level_gain"],
+        stds["level_phase_deg"] * DEGREE,
     )
 
 

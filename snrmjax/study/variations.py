@@ -1,4 +1,4 @@
-"""What varies between the members of a study: listed values and distributions."""
+"""Variations between the members of a study: listed values and distributions."""
 
 import abc
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import POSITIVE
 
 _FEWEST, _MOST = 2, 10_000_000  # values of a range
-_NORMAL_LIMIT = 1e-12  # quantiles nearer to 0 or 1 than this have no place in a sample
+_NORMAL_LIMIT = 1e-12  # samples of the unit interval are clipped to this distance from 0 and 1
 _ROUNDING = 1e-9  # of correlations, which files give with few digits
 
 
@@ -31,7 +31,7 @@ def _array(values: ArrayLike) -> np.ndarray:
 
 
 class AbstractVariation(eqx.Module):
-    """One quantity, or several that vary together, of the members of a study."""
+    """One varied quantity of a study, or several that vary together."""
 
     names: eqx.AbstractVar[tuple[str, ...]]
 
@@ -43,13 +43,13 @@ class AbstractVariation(eqx.Module):
         """
 
     def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """Values at points of the unit cube, every one of which is as likely."""
+        """Values at points of the unit cube, by the inverse distribution function."""
         from scipy.special import ndtri
 
         return self.at(ndtri(np.clip(unit, _NORMAL_LIMIT, 1 - _NORMAL_LIMIT)), np)
 
     def grid(self) -> Float[np.ndarray, " value"] | None:
-        """The values that a grid goes through; None where there are none."""
+        """The values of a grid; None for a distribution."""
         return None
 
     def _check(self, *positive: str) -> None:
@@ -65,7 +65,7 @@ class AbstractVariation(eqx.Module):
 
 
 class Discrete(AbstractVariation):
-    """Values one by one; a sample takes each of them equally often.
+    """Listed values; a sample takes each of them equally often.
 
     Raises `ValueError` for no values and for one that is not finite.
     """
@@ -80,7 +80,7 @@ class Discrete(AbstractVariation):
         self._check()
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
-        """Raises `ValueError`: values one by one have no derivative."""
+        """Raises `ValueError`: listed values have no derivative."""
         raise ValueError(f"{self.names[0]} takes listed values: derivatives need a distribution.")
 
     def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
@@ -94,7 +94,7 @@ class Discrete(AbstractVariation):
 
 
 class Uniform(AbstractVariation):
-    """Any value between two ends; a grid goes through `points` of them, equally spaced.
+    """A uniform distribution; a grid has `points` equally spaced values of it.
 
     Raises `ValueError` for an empty range and for too few points.
     """
@@ -115,11 +115,11 @@ class Uniform(AbstractVariation):
             raise ValueError(f"`points` of {name} must be from {_FEWEST} to {_MOST}, not {points}.")
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
-        """By the normal distribution's function."""
+        """By the normal distribution function."""
         return self.low + (self.high - self.low) * jax.scipy.stats.norm.cdf(z)
 
     def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """Straight from the unit interval."""
+        """Linear in the point of the unit interval."""
         return self.low + (self.high - self.low) * unit
 
     def grid(self) -> Float[np.ndarray, " value"] | None:
@@ -164,9 +164,9 @@ class LogNormal(AbstractVariation):
 
 
 class MultivariateNormal(AbstractVariation):
-    """Several quantities that are normal together, such as a fit's posterior.
+    """Jointly normal quantities, such as a fit's posterior.
 
-    Raises `ValueError` where sizes disagree, and for a covariance that is not symmetric, has a
+    Raises `ValueError` where shapes disagree, and for a covariance that is not symmetric, has a
     negative variance or is not positive semidefinite.
     """
 
@@ -185,9 +185,9 @@ class MultivariateNormal(AbstractVariation):
         self._check()
         k = int(np.argmin(np.diag(variance)))
         if variance[k, k] < 0:
-            said = f"{variance[k, k]:g}"
+            value = f"{variance[k, k]:g}"
             raise ValueError(
-                f"the variance of {self.names[k]} must not be negative, but is {said}."
+                f"the variance of {self.names[k]} must not be negative, but is {value}."
             )
         scale = _scale(variance)
         correlation = variance / np.outer(scale, scale)
@@ -201,7 +201,7 @@ class MultivariateNormal(AbstractVariation):
             )
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
-        """By the symmetric root of the correlations."""
+        """By a square root of the correlation matrix."""
         scale = _scale(self.covariance, xp)
         values, vectors = xp.linalg.eigh(self.covariance / xp.outer(scale, scale))
         root = scale[:, None] * vectors * xp.sqrt(xp.maximum(values, 0.0))
@@ -209,7 +209,7 @@ class MultivariateNormal(AbstractVariation):
 
 
 def stated_variations(model: Structure) -> tuple[Normal, ...]:
-    """The numbers of a model that state a standard deviation, as normally distributed quantities.
+    """The parameters of a model with a stated standard deviation, as normal distributions.
 
     Raises `ValueError` where none does.
     """
@@ -220,13 +220,13 @@ def stated_variations(model: Structure) -> tuple[Normal, ...]:
 
 
 def posterior_variation(calibrated: CalibratedModel | BackboneCalibration) -> MultivariateNormal:
-    """The fitted parameters of a calibration with their covariance, normally distributed.
+    """The fitted parameters of a calibration with their covariance, as a joint normal distribution.
 
     Raises `ValueError` for a calibration that did not converge.
     """
     if not calibrated.converged:
         raise ValueError(
-            f"the calibration did not converge ({calibrated.status}): its covariance says nothing."
+            f"the calibration did not converge ({calibrated.status}): its covariance is not valid."
         )
     return MultivariateNormal(calibrated.names, calibrated.values, calibrated.covariance)
 

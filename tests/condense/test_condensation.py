@@ -1,4 +1,4 @@
-"""One potential out of static load cases: the known one, and what is said about bad cases."""
+"""One potential out of static load cases: the known one, and the warnings about bad cases."""
 
 import dataclasses
 
@@ -26,48 +26,51 @@ def kinds(condensation):
 
 def test_the_condensed_potential_of_a_hidden_membrane_is_recovered(curved):
     truth, basis, cases = curved
-    found = sj.condense.reduced_model(basis, cases)
+    result = sj.condense.reduced_model(basis, cases)
     known = truth.coefficients()
-    assert set(found.potential.monomials) == set(known)
+    assert set(result.potential.monomials) == set(known)
     # Round-off of the load cases is 1e-16 of the linear force, terms are 1e-5 of it and more.
-    expected = [known[m] for m in found.potential.monomials]
-    np.testing.assert_allclose(found.potential.coefficient, expected, rtol=1e-7)
-    assert np.all(found.potential.coefficient_std < 1e-6 * np.abs(expected))
-    assert found.quality.misfit < 1e-12
-    assert found.quality.cross_validated < 1e-12
-    np.testing.assert_allclose(found.quality.linear_stiffness_ratio, 1.0, rtol=1e-9)
-    assert np.max(np.abs(found.quality.energy_error)) < 1e-12
-    assert found.warnings == ()
+    expected = [known[m] for m in result.potential.monomials]
+    np.testing.assert_allclose(result.potential.coefficient, expected, rtol=1e-7)
+    assert np.all(result.potential.coefficient_std < 1e-6 * np.abs(expected))
+    assert result.quality.misfit < 1e-12
+    assert result.quality.cross_validated < 1e-12
+    np.testing.assert_allclose(result.quality.linear_stiffness_ratio, 1.0, rtol=1e-9)
+    assert np.max(np.abs(result.quality.energy_error)) < 1e-12
+    assert result.warnings == ()
 
 
 @pytest.mark.long
 def test_degree_five_finds_no_terms_that_are_not_there(curved):
     truth, basis, _ = curved
     cases = cases_of(truth, sj.condense.modal_loads(basis, 4.0, degree=5))
-    found = sj.condense.reduced_model(basis, cases, degree=5)
+    result = sj.condense.reduced_model(basis, cases, degree=5)
     known = truth.coefficients()
-    force = np.abs(found.potential.force(cases.modal_displacement)).max()
-    for monomial, value in zip(found.potential.monomials, found.potential.coefficient, strict=True):
+    force = np.abs(result.potential.force(cases.modal_displacement)).max()
+    for monomial, value in zip(
+        result.potential.monomials, result.potential.coefficient, strict=True
+    ):
         if len(monomial) <= 4:
             assert float(value) == pytest.approx(known[monomial], rel=1e-5)
-    highest = [len(m) > 4 for m in found.potential.monomials]
+    highest = [len(m) > 4 for m in result.potential.monomials]
     extra = dataclasses.replace(
-        found.potential, coefficient=jnp.where(jnp.array(highest), found.potential.coefficient, 0.0)
+        result.potential,
+        coefficient=jnp.where(jnp.array(highest), result.potential.coefficient, 0.0),
     )
     assert np.abs(extra.force(cases.modal_displacement)).max() < 1e-8 * force
 
 
 def test_a_reduced_structure_holds_the_static_forces(curved):
     _, basis, cases = curved
-    found = sj.condense.reduced_model(basis, cases)
+    result = sj.condense.reduced_model(basis, cases)
     sensors = {"first": basis.shapes[0], "mean": basis.shapes.mean(axis=0)}
-    model = found.structure(0.01, sensors=sensors, participation=[1.0, 2.0, 3.0], name="beam")
+    model = result.structure(0.01, sensors=sensors, participation=[1.0, 2.0, 3.0], name="beam")
     assert model.modes.sensors == ("first", "mean")
     np.testing.assert_allclose(model.modes.natural_frequency, basis.frequency)
     q = cases.modal_displacement
     held = q * model.linear_terms().stiffness + model.memoryless_force(q, jnp.zeros_like(q))
     np.testing.assert_allclose(held, cases.force, atol=1e-10 * np.abs(cases.force).max())
-    np.testing.assert_allclose(found.force(q), held, rtol=1e-12)
+    np.testing.assert_allclose(result.force(q), held, rtol=1e-12)
 
 
 def test_coefficients_scale_with_displacement_exactly_in_value_and_slope(curved):
@@ -102,7 +105,7 @@ def test_leaving_out_in_closed_form_is_fitting_without(curved):
             design[keep].reshape(-1, len(monomials)), target[keep].reshape(-1), rcond=None
         )[0]
         values.append(x)
-        np.testing.assert_allclose(target[k] - design[k] @ x, fast.held_out[k], atol=1e-9)
+        np.testing.assert_allclose(target[k] - design[k] @ x, fast.cross_validated[k], atol=1e-9)
     n = len(values)
     spread = np.sqrt((n - 1) * np.var(values, axis=0))
     np.testing.assert_allclose(fast.std, spread, rtol=1e-6)
@@ -112,18 +115,18 @@ def test_leaving_out_in_closed_form_is_fitting_without(curved):
     ("rows", "factor", "column", "reason"),
     [
         ([4], -1.0, slice(None), "sign"),
-        ([7], 1000.0, slice(None), "another unit"),
+        ([7], 1000.0, slice(None), "wrong unit"),
         ([3, 20], 1.1, 1, ""),
     ],
 )
 def test_the_inconsistent_cases_are_named(curved, rows, factor, column, reason):
     _, basis, cases = curved
-    found = sj.condense.reduced_model(basis, changed(cases, rows, factor, column))
-    (said,) = [one for one in found.warnings if one.kind == "inconsistent_case"]
-    assert said["cases"] == tuple(rows)
-    assert all(cases.names[row] in said["names"] for row in rows)
-    assert said["against_force"] is (reason == "sign")
-    assert (said["times"] is not None) is (reason == "another unit")
+    result = sj.condense.reduced_model(basis, changed(cases, rows, factor, column))
+    (fact,) = [one for one in result.warnings if one.kind == "inconsistent_case"]
+    assert fact["cases"] == tuple(rows)
+    assert all(cases.names[row] in fact["names"] for row in rows)
+    assert fact["against_force"] is (reason == "sign")
+    assert (fact["times"] is not None) is (reason == "wrong unit")
 
 
 def test_too_small_loads_too_short_a_polynomial_and_too_large_loads_are_told_apart(curved):
@@ -146,10 +149,10 @@ def test_beyond_a_snap_through_the_regime_is_said_to_be_another():
         stiffness * q - 3 * a * q**2 + 2.2 * q**3, q, np.ones(12, dtype=bool)
     )
     basis = sj.condense.ReductionBasis(np.sqrt([stiffness]), np.eye(1), np.eye(1), (1,))
-    found = sj.condense.reduced_model(basis, cases)
-    assert kinds(found) == ["other_regime"]
+    result = sj.condense.reduced_model(basis, cases)
+    assert kinds(result) == ["other_regime"]
     within = stiffness - 6 * a * q[:, 0] + 6.6 * q[:, 0] ** 2 < 0
-    assert found.warnings[0]["cases"] == tuple(np.flatnonzero(within))
+    assert result.warnings[0]["cases"] == tuple(np.flatnonzero(within))
 
 
 def test_cases_without_solution_repeated_ones_and_wrong_energy_or_frequency_are_said(curved):
@@ -158,11 +161,11 @@ def test_cases_without_solution_repeated_ones_and_wrong_energy_or_frequency_are_
     lost[[2, 9]] = False
     q = np.where(lost[:, None], cases.modal_displacement, np.nan)
     partial = dataclasses.replace(cases, converged=lost, modal_displacement=q)
-    found = sj.condense.reduced_model(basis, partial)
-    assert kinds(found) == ["not_converged"]
-    assert found.warnings[0]["cases"] == (2, 9)
+    result = sj.condense.reduced_model(basis, partial)
+    assert kinds(result) == ["not_converged"]
+    assert result.warnings[0]["cases"] == (2, 9)
     full = sj.condense.reduced_model(basis, cases)
-    np.testing.assert_allclose(found.potential.coefficient, full.potential.coefficient, rtol=1e-6)
+    np.testing.assert_allclose(result.potential.coefficient, full.potential.coefficient, rtol=1e-6)
     twice = jax.tree.map(lambda rows: jnp.concatenate([rows, rows[:1]]), cases)
     twice = dataclasses.replace(twice, names=())
     assert kinds(sj.condense.reduced_model(basis, twice)) == ["repeated_case"]
@@ -188,7 +191,7 @@ def test_what_cannot_be_fitted_is_refused(curved):
     loads = sj.condense.modal_loads(basis, 4.0, most_modes=1, levels=(0.4, 0.6, 0.8, 1.0)).force
     q = np.asarray(loads) / np.asarray(basis.frequency) ** 2
     single = sj.condense.StaticCases(loads, q, np.ones(len(q), dtype=bool))
-    with pytest.raises(ValueError, match=r"do not tell .* apart: .*123"):
+    with pytest.raises(ValueError, match=r"do not determine .* separately: .*123"):
         sj.condense.reduced_model(basis, single)
     still = dataclasses.replace(cases, force=np.asarray(cases.force) * [1, 0, 1])
     with pytest.raises(ValueError, match="force of mode 3 is zero"):

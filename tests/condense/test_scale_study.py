@@ -48,7 +48,7 @@ def test_a_scale_whose_cases_fail_has_no_numbers_and_ends_the_plateau():
     study = load_scale_study(basis, failing, 1.0, scales=(0.5, 1.0, 2.0, 8.0))
     np.testing.assert_array_equal(np.isfinite(study.misfit), [True, True, True, False])
     assert study.plateau == (0.5, 2.0)
-    with pytest.raises(ValueError, match="positive and rise"):
+    with pytest.raises(ValueError, match="positive and ascending"):
         load_scale_study(basis, solve, 1.0, scales=(1.0, 0.5))
 
 
@@ -66,8 +66,8 @@ def test_a_static_path_ends_where_it_snaps_through():
     limit = turn - 3 * turn**2 + 2.2 * turn**3
     beyond = limit * np.linspace(1.05, 4.0, 30)[:, None]
     forces = jnp.array([[0.5 * limit], [0.99 * limit], [1.05 * limit], [-1.0], *beyond])
-    found = np.asarray(static_displacement(jnp.array([1.0]), potential, forces))[:, 0]
-    assert np.all(np.isnan(found[[2, *range(4, 34)]]))  # though there is another branch
-    held = found - 3 * found**2 + 2.2 * found**3
+    result = np.asarray(static_displacement(jnp.array([1.0]), potential, forces))[:, 0]
+    assert np.all(np.isnan(result[[2, *range(4, 34)]]))  # though there is another branch
+    held = result - 3 * result**2 + 2.2 * result**3
     np.testing.assert_allclose(held[[0, 1, 3]], np.asarray(forces)[[0, 1, 3], 0], rtol=1e-9)
-    assert found[1] < turn
+    assert result[1] < turn

@@ -1,4 +1,4 @@
-"""Completed models, and answers whose parameters are none that a structure can have."""
+"""Completed models, and answers with unphysical parameters."""
 
 import json
 
@@ -14,7 +14,7 @@ from snrmjax.report.pages.diagnosis import write
 
 
 def fed(velocity):
-    """A linear damping below zero, −0.2 of the model's, and quadratic damping that outweighs it."""
+    """A negative linear damping, −0.2 of the model's, and a larger quadratic damping."""
     return -1.2 * 2 * ZETA * OMEGA + 120.0 * velocity
 
 
@@ -31,9 +31,9 @@ def test_a_negative_damping_ratio_is_no_reason_to_lose_the_answer(tmp_path):
     assert "damping_ratio" in note["reason"]
     ratio = float(note["reason"].split("but is ")[1].rstrip("."))
     assert ratio == pytest.approx(-0.2 * ZETA, rel=0.1)
-    told = json.loads((tmp_path / "diagnosis.json").read_text())
-    assert told["effects"] == list(found.effects)
-    assert told["gap"]["after"] < 1.2
+    written = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert written["effects"] == list(found.effects)
+    assert written["gap"]["after"] < 1.2
     assert (tmp_path / "report.html").exists()
     assert (tmp_path / "residuals.png").exists()
     assert not (tmp_path / "model.toml").exists()
@@ -59,7 +59,7 @@ def test_a_model_that_lacks_nothing_stays_as_it_is():
     assert found.status is CompletedStatus.NOTHING_ADDED
 
 
-def test_a_completed_model_has_what_was_found(tmp_path):
+def test_a_completed_model_has_the_identified_effects(tmp_path):
     found = completed_model(
         linear_model(),
         {"mode_1.damping_ratio": 0.02},

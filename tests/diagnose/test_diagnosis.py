@@ -1,4 +1,4 @@
-"""Diagnoses of sets that time integration made, and of states that obey a changed balance."""
+"""Diagnoses of time-integrated sets, and of states with a modified force balance."""
 
 import dataclasses
 import functools
@@ -21,12 +21,12 @@ from truths.balanced_sets import (
 )
 
 import snrmjax as sj
-from snrmjax.diagnose.checks.residuals import held_out
+from snrmjax.diagnose.checks.residuals import withheld_level
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.effect_fit import (
     baseline_fit,
     fit_effect,
-    with_errors_passed_on,
+    with_propagated_errors,
 )
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
@@ -44,13 +44,13 @@ pytestmark = pytest.mark.usefixtures("optimised")
 
 @functools.cache
 def blind(name):
-    """A set whose truth stands in another file."""
+    """A set and its truth, which is in another file."""
     return sj.diagnose_model(*files(name)), KEYS[name]
 
 
 @pytest.mark.long
-def test_a_pair_that_its_own_weighing_refutes_is_no_better_than_one_effect():
-    """The curved beam, stiffening, whose peaks were read for its fundamental: 13 % too large.
+def test_a_pair_that_does_not_fit_is_no_better_than_one_effect():
+    """The curved beam, stiffening, with peak values taken as fundamentals: 13 % too large.
 
     A pair took the place of the gain that fits, and then fell short of it by 70 of χ².
     """
@@ -89,14 +89,14 @@ def test_the_hidden_effect_is_in_the_answer_and_the_gap_closes(name):
 
 
 @pytest.mark.long
-def test_unseen_levels_resonate_where_the_completed_model_says():
+def test_withheld_levels_resonate_where_the_completed_model_predicts():
     model, data = files("blind_12")
     found, _ = blind("blind_12")
     top = max(found.checks.completed_without)
     force = level_forces(data)[top]
     (curves,) = responses(found.checks.completed_without[top], data, [force])
     predicted, measured = simulated_resonance(curves, 0), measured_resonance(data, top, 0)
-    # The model that has not seen the level is another one than that which has seen all.
+    # The model completed without the level differs from the one completed with all.
     assert found.checks.completed_without[top].effects != found.completed.effects
     assert predicted.frequency == pytest.approx(measured.frequency, rel=2e-3)
     assert predicted.velocity == pytest.approx(measured.velocity, rel=0.02)
@@ -109,7 +109,7 @@ def test_where_nothing_is_hidden_nothing_is_found():
     assert found.verdict == "none"
     assert found.effects == ()
     assert found.gap.after == found.gap.before == pytest.approx(1.0, abs=0.2)
-    # Every effect that is looked for is given a size that would have been seen.
+    # Every searched effect has a detection limit.
     searched = {kind for kind, effect in EFFECTS.items() if effect.searched}
     assert {name.partition(".")[0] for name in found.detection_limits} == searched
     assert not searched & {"close_mode", "static_preload"}
@@ -130,7 +130,7 @@ def test_an_effect_that_no_one_knows_is_not_named():
 
 
 @pytest.mark.long
-def test_softening_by_many_bandwidths_is_named_whatever_power_its_curve_seems_to_have():
+def test_softening_by_many_bandwidths_is_named_although_its_curve_follows_another_power():
     """25 half-power bandwidths, levels' gains 5 % and frequencies 0.5 % off (set by another code).
 
     By the linear balance the stiffness changes with the power 0.7 of the amplitude.
@@ -145,16 +145,16 @@ def test_softening_by_many_bandwidths_is_named_whatever_power_its_curve_seems_to
 
 
 @pytest.mark.long
-def test_two_simple_effects_are_not_read_as_a_further_mode():
+def test_two_simple_effects_are_not_mistaken_for_a_further_mode():
     # A 1:2 resonance with free frequency and damping fits as well, with one parameter more.
     found, key = blind("blind_13")
     assert sorted(found.effects) == sorted(key["effects"])
 
 
-def test_what_an_effect_turns_of_an_uncertain_baseline_is_no_second_effect():
-    """A phase error of 6.4° turns a tenth of a wrong cubic stiffness into damping, ∝ Q² as it is.
+def test_an_uncertain_baseline_rotated_by_an_effect_is_no_second_effect():
+    """A phase error of 6.4° rotates a tenth of a wrong cubic stiffness into damping, ∝ Q² as it is.
 
-    It passed for cubic damping, the more surely the higher the level.
+    It was mistaken for cubic damping, the more so the higher the level.
     """
     found, key = blind("blind_17")
     assert (found.verdict, found.effects) == ("named", tuple(key["effects"]))
@@ -168,7 +168,7 @@ def test_a_mode_close_by_is_not_taken_for_noise():
 
 
 @pytest.mark.long
-def test_a_law_is_drawn_where_an_imitation_misses_the_level_left_out():
+def test_a_law_is_drawn_where_a_confounder_misses_the_withheld_level():
     found, key = blind("blind_16")
     assert key["outside"] == "magnet_stiffness"
     assert found.verdict == "drawn"
@@ -177,15 +177,15 @@ def test_a_law_is_drawn_where_an_imitation_misses_the_level_left_out():
     # k y [1/(1 + (y/w)²) − 1] of y = q/Q in units of ω₀²Q, as the key has it.
     stiffness, width = key["parameters"].values()
     base, modes = key["baseline"], files("blind_16")[0].modes
-    shape, size = float(modes.mode_shape[0, 0]), base["displacement_scale"]
-    y = law.at / shape / size
+    shape, scale = float(modes.mode_shape[0, 0]), base["displacement_scale"]
+    y = law.at / shape / scale
     force = stiffness * y * (1 / (1 + (y / width) ** 2) - 1)
-    force = force * (2 * np.pi * base["frequency_hz"]) ** 2 * size / shape
+    force = force * (2 * np.pi * base["frequency_hz"]) ** 2 * scale / shape
     inside = np.abs(force - law.force) <= 1.96 * law.force_std
     assert np.sum(np.gradient(law.at)[inside]) > 0.9 * law.at[-1]
 
 
-def test_a_step_that_promises_nothing_is_taken_without_a_look(monkeypatch):
+def test_a_step_of_negligible_gain_is_taken_without_evaluation(monkeypatch):
     predictions = predictions_of(linear_model(), balanced(quadratic))
     one, misfit = (
         candidate("quadratic_damping", scales_of(predictions)),
@@ -193,23 +193,23 @@ def test_a_step_that_promises_nothing_is_taken_without_a_look(monkeypatch):
     )
     best = fit_effect(misfit, one)
     std = 1 / np.linalg.norm(misfit.noise.decorrelated(best.slopes[:, 0]))
-    looked = []
+    evaluations = []
     whole = WeightedMisfit.evaluated
 
     def counted(self, labels, values):
-        looked.append(len(values))
+        evaluations.append(len(values))
         return whole(self, labels, values)
 
     monkeypatch.setattr(WeightedMisfit, "evaluated", counted)
     # 0.1σ off, χ² is 0.01 above its least: less than what ends a fit.
     again = fit_effect(misfit, one._replace(starts=((best.values[0] + 0.1 * std,),)))
-    assert looked == [1]
+    assert evaluations == [1]
     # Of the step Marquardt's damping leaves a hundredth: 1e-3σ, and 1e-4 of what χ² was above.
     assert again.values[0] == pytest.approx(best.values[0], abs=5e-3 * std)
     assert again.chi_square == pytest.approx(best.chi_square, abs=1e-4)
-    # 1σ off it is looked at.
+    # 1σ off it is evaluated.
     fit_effect(misfit, one._replace(starts=((best.values[0] + std,),)))
-    assert len(looked) > 2
+    assert len(evaluations) > 2
 
 
 CLOSE = {"modal_constant": 0.3, "frequency_hz": 1.03 * OMEGA / (2 * np.pi), "damping_ratio": 0.01}
@@ -227,7 +227,7 @@ def test_a_mode_close_by_is_found():
 
 
 @pytest.mark.long
-def test_a_mode_close_by_is_found_beside_a_nonlinearity():
+def test_a_mode_close_by_is_found_in_addition_to_a_nonlinearity():
     data = beside(1.03 * OMEGA, 0.01, 0.3, stiffening=0.03, seed=1)
     found = sj.diagnose_model(linear_model(), data)
     assert set(found.effects) == {"cubic_stiffness", "close_mode"}
@@ -239,7 +239,7 @@ def test_a_mode_close_by_is_found_beside_a_nonlinearity():
 
 
 @pytest.mark.long
-def test_what_is_kept_beside_a_mode_close_by_is_chosen_anew():
+def test_laws_in_addition_to_a_mode_close_by_are_chosen_anew():
     data = beside(0.96 * OMEGA, 0.01, 0.3, stiffening=-0.01, seed=5)
     found = sj.diagnose_model(linear_model(), data)
     assert found.effects[-1] == "close_mode"
@@ -265,8 +265,8 @@ def test_a_model_without_damping_may_have_a_mode_close_by():
 
 def test_a_phase_error_is_not_taken_for_a_mode_close_by():
     data = balanced(lambda v: 0.0 * v, seed=2)
-    turned = dataclasses.replace(data, velocity=data.velocity * np.exp(-0.045j))
-    found = sj.diagnose_model(linear_model(), turned)
+    rotated = dataclasses.replace(data, velocity=data.velocity * np.exp(-0.045j))
+    found = sj.diagnose_model(linear_model(), rotated)
     assert (found.verdict, found.effects) == ("named", ("sensor_phase_error",))
     assert found.candidates == (("sensor_phase_error",),)
 
@@ -320,11 +320,11 @@ def test_too_few_states_and_a_model_of_something_else_are_said():
 def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():
     predictions = predictions_of(linear_model(), balanced(lambda v: 0.0 * v))
     misfit = weighted_misfit(predictions)
-    turned = candidate("sensor_phase_error", scales_of(predictions))
-    fit = fit_effect(misfit, turned)._replace(values=np.array([10.0]))
-    own, other = (one.passed_on.slopes for one in (misfit, with_errors_passed_on(misfit, fit)))
+    rotated = candidate("sensor_phase_error", scales_of(predictions))
+    fit = fit_effect(misfit, rotated)._replace(values=np.array([10.0]))
+    own, other = (one.propagated.slopes for one in (misfit, with_propagated_errors(misfit, fit)))
     before, after = (part[:, 0] + 1j * part[:, 1] for part in (own, other))
-    # The motion is the recorded one turned back by 10°, and so is the force that it needs. Slopes
+    # The motion is the recorded one rotated back by 10°, and so is the force that it needs. Slopes
     # are differences over 2.5e-6 of a parameter: 1e-5 of each is 2.5e-11 of the force.
     turn = np.exp(-1j * np.radians(10.0))
     np.testing.assert_allclose(after, turn * before, rtol=0, atol=2e-5 * np.abs(before).max())
@@ -337,18 +337,18 @@ def test_levels_whose_mode_differs_are_no_effect_whether_that_is_stated_or_not()
     unaware = sj.diagnose_model(linear_model(), data)
     assert (unaware.verdict, unaware.effects) == ("none", ())
     assert unaware.gap.before == pytest.approx(1.0, abs=0.15)
-    differ = said_of_levels(unaware)
+    differ = note_on_levels(unaware)
     assert differ["frequency"] == pytest.approx(np.std(drawn, ddof=1), rel=0.2)
-    told = sj.diagnose_model(linear_model(level_frequency_std=3e-3 * OMEGA), data)
-    assert (told.verdict, told.effects) == ("none", ())
-    assert told.gap.before == pytest.approx(1.0, abs=0.15)
-    assert said_of_levels(told) is None
+    stated = sj.diagnose_model(linear_model(level_frequency_std=3e-3 * OMEGA), data)
+    assert (stated.verdict, stated.effects) == ("none", ())
+    assert stated.gap.before == pytest.approx(1.0, abs=0.15)
+    assert note_on_levels(stated) is None
     alike = sj.diagnose_model(linear_model(), balanced(lambda v: 0.0 * v, seed=4))
-    assert said_of_levels(alike) is None
+    assert note_on_levels(alike) is None
 
 
-def said_of_levels(found):
-    """The note that levels differ, by what the data themselves show."""
+def note_on_levels(found):
+    """The note on level errors estimated from the data."""
     notes = [n for n in found.notes if getattr(n, "kind", "") == "levels_not_stated"]
     return next((note for note in notes if note["of_data"]), None)
 
@@ -362,7 +362,7 @@ def test_a_completed_model_has_the_baseline_that_the_data_know_better():
 
 
 def silent(data):
-    """The states without any word of their noise."""
+    """The states without stated noise."""
     nothing = np.full((data.n_states, 1), np.nan)
     return dataclasses.replace(
         data, velocity_std=nothing, phase_std=nothing, force_std=nothing[:, 0]
@@ -370,13 +370,13 @@ def silent(data):
 
 
 @pytest.mark.long
-def test_without_stated_noise_its_size_is_found_with_the_effect():
+def test_unstated_noise_is_estimated_with_the_effect():
     found = sj.diagnose_model(linear_model(), silent(balanced(quadratic)))
     assert found.effects == ("quadratic_damping",)
     (note,) = (note for note in found.notes if note.kind == "noise_not_stated")
-    size = 100 * note["size"]
+    percent = 100 * note["size"]
     # Velocity, phase and force together, as one relative error of all.
-    assert size == pytest.approx(100 * NOISE["velocity"], rel=0.35)
+    assert percent == pytest.approx(100 * NOISE["velocity"], rel=0.35)
 
 
 @pytest.mark.long
@@ -393,7 +393,7 @@ def test_levels_that_differ_hide_no_effect_and_make_none():
     assert note["frequency"] > 0
 
 
-def test_an_unknown_force_gain_passes_for_nothing():
+def test_an_unknown_force_gain_is_not_mistaken_for_an_effect():
     data = balanced(quadratic)
     louder = dataclasses.replace(data, force=1.5 * data.force, force_std=1.5 * data.force_std)
     found = sj.diagnose_model(linear_model(), louder, force_gain_std=1.0)
@@ -402,13 +402,13 @@ def test_an_unknown_force_gain_passes_for_nothing():
     known = sj.diagnose_model(linear_model(), data).parameters["quadratic_damping.coefficient"]
     assert abs(value - known[0]) < 3 * std
     assert found.answer.force_gain == pytest.approx(1 / 1.5, rel=0.01)
-    # Gains and the modal mass are the same to a force of unknown size.
+    # A force of unknown magnitude cannot be separated from gains and the modal mass.
     assert not any("gain" in name or "mass" in name for name in found.detection_limits)
 
 
-@pytest.mark.parametrize(("gain_std", "asked"), [(0.0, True), (0.05, True), (1.0, False)])
-def test_beside_a_force_that_may_be_nothing_no_mode_close_by_is_asked(gain_std, asked, monkeypatch):
-    """It could be all that is seen: the measured suspended beam then had a gain of 5e-6 N/V."""
+@pytest.mark.parametrize(("gain_std", "searched"), [(0.0, True), (0.05, True), (1.0, False)])
+def test_with_an_almost_unknown_force_no_mode_close_by_is_searched(gain_std, searched, monkeypatch):
+    """It could explain all: the measured suspended beam then had a gain of 5e-6 N/V."""
     kinds = []
 
     def noted(readings, tried):
@@ -418,12 +418,12 @@ def test_beside_a_force_that_may_be_nothing_no_mode_close_by_is_asked(gain_std, 
     monkeypatch.setattr("snrmjax.diagnose.explained_parts.best_hypotheses", noted)
     with pytest.raises(InterruptedError):
         sj.diagnose_model(linear_model(), balanced(quadratic), force_gain_std=gain_std)
-    assert ("close_mode" in kinds) == asked
+    assert ("close_mode" in kinds) == searched
     assert "cubic_stiffness" in kinds
 
 
-def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_states_share():
-    """The shared errors are solved for here, by orthogonal steps, and nowhere eliminated."""
+def test_a_withheld_level_is_accurate_where_noise_is_far_below_shared_errors():
+    """The shared errors are solved for here, by QR, and not eliminated."""
     data = balanced(quadratic)
     precise = {name: 1e-3 * getattr(data, name) for name in ("velocity_std", "force_std")}
     data = dataclasses.replace(data, phase_std=1e-3 * data.phase_std, **precise)
@@ -431,18 +431,18 @@ def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_s
     nothing, shared = baseline_fit(misfit), misfit.noise.shared
     out = np.asarray(data.level)[misfit.noise.state] == 2
     system = np.vstack([shared[~out], np.eye(shared.shape[1])])
-    told, triangle = np.linalg.qr(system)
-    common = np.linalg.solve(triangle, told[: (~out).sum()].T @ misfit.base[~out])
+    directions, triangle = np.linalg.qr(system)
+    common = np.linalg.solve(triangle, directions[: (~out).sum()].T @ misfit.base[~out])
     left = misfit.base[out] - shared[out] @ common
     spread = np.linalg.solve(triangle.T, shared[out].T).T
     inner = np.linalg.qr(np.vstack([spread.T, np.eye(len(left))]), mode="r")
     expected = np.linalg.norm(np.linalg.solve(inner.T, left)) / np.sqrt(len(left))
-    found = held_out(misfit, nothing, nothing, 2)
+    found = withheld_level(misfit, nothing, nothing, 2)
     assert found.after == found.before == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.long
-def test_data_of_another_mode_and_of_one_level_are_said():
+def test_data_of_another_mode_and_of_one_level_are_reported():
     far = sj.diagnose_model(linear_model(frequency=1.4 * OMEGA), balanced(quadratic))
     assert "linear_frequency_shift" in far.effects
     assert "frequency_off" in {note.kind for note in far.notes}

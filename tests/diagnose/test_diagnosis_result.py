@@ -1,4 +1,4 @@
-"""What a diagnosis shows of itself: one screen of text, a labelled data set, a figure."""
+"""Output of a diagnosis: one screen of text, a labelled data set, a figure."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ def found():
     return sj.diagnose_model(linear_model(), balanced(quadratic))
 
 
-def test_a_diagnosis_says_itself_on_one_screen(found):
+def test_a_diagnosis_prints_on_one_screen(found):
     first, *lines = repr(dataclasses.replace(found, notes=("a note.",))).splitlines()
     assert first == f"Diagnosis: {found.verdict_sentence}"
     value, std = found.parameters["quadratic_damping.coefficient"]
@@ -34,8 +34,8 @@ def test_a_model_that_stays_as_it_is_ends_so(found):
     nothing = found.answer._replace(
         status=MinimisationStatus.NOT_FITTED, completed_status=CompletedStatus.NOTHING_ADDED
     )
-    told = repr(dataclasses.replace(found, answer=nothing, notes=()))
-    assert told.splitlines()[-1].strip() == "status: nothing was added to the model"
+    texts = repr(dataclasses.replace(found, answer=nothing, notes=()))
+    assert texts.splitlines()[-1].strip() == "status: nothing was added to the model"
 
 
 def test_a_diagnosis_is_a_labelled_data_set(found):
@@ -61,5 +61,5 @@ def test_a_diagnosis_is_drawn(found):
 
 def test_every_verdict_has_a_sentence_of_its_own(found):
     whole = dataclasses.replace(found, parts=())  # as where phases are unknown
-    told = {dataclasses.replace(whole, verdict=one).verdict_sentence for one in Verdict}
-    assert len(told) == len(Verdict) == 6
+    texts = {dataclasses.replace(whole, verdict=one).verdict_sentence for one in Verdict}
+    assert len(texts) == len(Verdict) == 6

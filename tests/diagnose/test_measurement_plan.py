@@ -1,4 +1,4 @@
-"""The loop closes: an open answer asks for a measurement, and the filled plan decides it.
+"""Closed loop: an open answer recommends a measurement, and the filled plan decides it.
 
 The truth is the closed form of `truths.growing_damping`: a mode whose damping grows as Q², by
 cubic damping or by van der Pol's, which differ in their third harmonics only.
@@ -49,7 +49,7 @@ def answer(omega, force, kind, rng):
 
 
 def fill(path, kind):
-    """What an engineer does with a plan: every empty field gets what was measured."""
+    """Fill every empty field of a plan with a measured value, as an engineer would."""
     rng = np.random.default_rng(3)
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -58,8 +58,8 @@ def fill(path, kind):
         velocity, third = answer(omega, float(row["force_n"]), kind, rng)
         floor = float(row["harmonic_std_m_s"])
         parts = {"": velocity}
-        for order, size in ((2, 0.0), (3, third)):
-            parts[f"h{order}_"] = size + floor / np.sqrt(2) * complex(*rng.normal(size=2))
+        for order, exact in ((2, 0.0), (3, third)):
+            parts[f"h{order}_"] = exact + floor / np.sqrt(2) * complex(*rng.normal(size=2))
         for name, value in parts.items():
             for part, number in (("re", value.real), ("im", value.imag)):
                 if f"velocity_{name}{part}_m_s" in row:
@@ -89,7 +89,7 @@ def run(folder, *options):
 
 
 def refusal(done):
-    """What a command that was refused says."""
+    """The message of a refused command."""
     assert isinstance(done.exception, ValueError)
     return str(done.exception)
 
@@ -112,15 +112,15 @@ def test_the_filled_plan_names_the_truth(asked, truth, tmp_path):
     assert after["candidates"] == [[truth]]
     (other,) = set(THIRD) - {truth}
     assert after["probabilities"].get(other, 0.0) < 0.01
-    assert any(note.startswith("before the further states") for note in after["notes"])
+    assert any(note.startswith("before the additional states") for note in after["notes"])
 
 
 def test_an_unfilled_plan_is_refused_by_row_and_column(asked, tmp_path):
     out = tmp_path / "out"
     done = run(asked, "--add", str(asked / "plan.csv"), "--out", str(out))
-    said = refusal(done)
-    assert "`velocity_re_m_s` must be filled in with what was measured" in said
-    assert "row 2 of plan.csv has an empty field" in said
+    message = refusal(done)
+    assert "`velocity_re_m_s` must be filled in with what was measured" in message
+    assert "row 2 of plan.csv has an empty field" in message
     assert not out.exists()
 
 
@@ -143,7 +143,7 @@ def test_a_forgotten_harmonic_is_refused_too(asked, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--continue", "one/diagnosis.json"), "`--continue` needs further states"),
         (("--add", "plan.csv", "--continue", "model.toml"), "must be a diagnosis.json"),
@@ -151,23 +151,25 @@ def test_a_forgotten_harmonic_is_refused_too(asked, tmp_path):
         (("first.csv", "--add", "plan.csv"), "`--add` is for one data file, but 2 are given"),
     ],
 )
-def test_what_cannot_be_continued_is_said(asked, tmp_path, options, said):
+def test_what_cannot_be_continued_is_refused(asked, tmp_path, options, message):
     paths = [one if one.startswith("--") else str(asked / one) for one in options]
     done = run(asked, *paths, "--out", str(tmp_path / "out"))
-    assert said in refusal(done)
+    assert message in refusal(done)
 
 
 def test_a_plan_has_what_was_asked_for_at_levels_of_its_own(asked):
     """Three phasor parts to be filled in; levels of the first test are 0 to 4."""
     with (asked / "plan.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    told = json.loads((asked / "one" / "diagnosis.json").read_text())["request"]
-    assert len(rows) == told["states"]
+    request = json.loads((asked / "one" / "diagnosis.json").read_text())["request"]
+    assert len(rows) == request["states"]
     assert {row["level"] for row in rows} == {"5"}
-    assert {f"velocity_h{order}_re_m_s" for order in told["harmonics"]} < set(rows[0])
+    assert {f"velocity_h{order}_re_m_s" for order in request["harmonics"]} < set(rows[0])
     for row in rows:
         assert row["velocity_re_m_s"] == row["velocity_im_m_s"] == ""
-        assert float(row["harmonic_std_m_s"]) == pytest.approx(told["harmonic_std_m_s"], rel=0.01)
+        assert float(row["harmonic_std_m_s"]) == pytest.approx(
+            request["harmonic_std_m_s"], rel=0.01
+        )
         # The noise is that of the first test.
         assert float(row["phase_std_deg"]) == pytest.approx(np.degrees(NOISE["phase"]), rel=0.01)
         ratio = float(row["force_std_n"]) / float(row["force_n"])
@@ -175,7 +177,7 @@ def test_a_plan_has_what_was_asked_for_at_levels_of_its_own(asked):
 
 
 def test_planned_states_resonate_where_the_structure_does(asked):
-    """Frequencies and forces of the plan hold velocities that the true structure has there."""
+    """The plan's velocities are those of the true structure at its frequencies and forces."""
     with (asked / "plan.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     rng = np.random.default_rng(0)
@@ -194,25 +196,25 @@ def test_what_changed_names_old_and_new_answers():
 
 
 def test_answers_of_a_file_are_those_of_a_diagnosis(tmp_path):
-    told = {"verdict": "named", "effects": ["b", "a"], "tried": []}
-    told["probabilities"] = {"a+b": 0.9, "none": 0.1}
-    (tmp_path / "diagnosis.json").write_text(json.dumps(told))
+    written = {"verdict": "named", "effects": ["b", "a"], "tried": []}
+    written["probabilities"] = {"a+b": 0.9, "none": 0.1}
+    (tmp_path / "diagnosis.json").write_text(json.dumps(written))
     former = read_former_answer(tmp_path / "diagnosis.json")
     assert former.probabilities == {answer_of(former.effects): 0.9, NONE: 0.1}
 
 
 @pytest.fixture(scope="module")
-def doubted():
+def ambiguous():
     """Quadratic damping without harmonics, as if another law had the same fundamental."""
     found = sj.diagnose_model(balanced_model(), balanced(quadratic))
     asked = Fact("record_harmonics")
     return dataclasses.replace(found, verdict=sj.diagnose.Verdict.AMBIGUOUS, recommended=asked)
 
 
-def test_where_no_test_was_compared_the_largest_level_is_measured_again(doubted):
-    assert (doubted.verdict, doubted.discriminating_test) == ("ambiguous", None)
-    plan = measurement_plan(doubted)
-    first = doubted.data.select(np.asarray(doubted.data.level) == 4)
+def test_where_no_test_was_compared_the_largest_level_is_measured_again(ambiguous):
+    assert (ambiguous.verdict, ambiguous.discriminating_test) == ("ambiguous", None)
+    plan = measurement_plan(ambiguous)
+    first = ambiguous.data.select(np.asarray(ambiguous.data.level) == 4)
     order = np.argsort(first.frequency)
     np.testing.assert_allclose(plan.states.frequency, np.asarray(first.frequency)[order])
     np.testing.assert_allclose(plan.states.force, np.asarray(first.force)[order])
@@ -220,11 +222,11 @@ def test_where_no_test_was_compared_the_largest_level_is_measured_again(doubted)
     assert (plan.harmonics, plan.harmonic_std) == ((2, 3), None)
 
 
-def test_where_harmonics_are_there_the_range_of_levels_is_widened(doubted):
-    data = doubted.data
+def test_where_harmonics_are_there_the_range_of_levels_is_widened(ambiguous):
+    data = ambiguous.data
     seen = np.full((data.n_states, 1, 2), 1e-3 + 0j)
     known = dataclasses.replace(data, harmonics=seen, harmonic_order=(2, 3))
-    plan = measurement_plan(dataclasses.replace(doubted, data=known))
+    plan = measurement_plan(dataclasses.replace(ambiguous, data=known))
     force, level = np.asarray(plan.states.force), np.asarray(plan.states.level)
     before, own = np.asarray(data.force), np.asarray(data.level)
     assert set(level) == {5, 6}
@@ -232,33 +234,33 @@ def test_where_harmonics_are_there_the_range_of_levels_is_widened(doubted):
     assert force[level == 6].max() == pytest.approx(1.5 * before[own == 4].max())
 
 
-def test_a_plan_states_no_errors_where_none_were_stated(doubted, tmp_path):
+def test_a_plan_states_no_errors_where_none_were_stated(ambiguous, tmp_path):
     silent = {name: np.full((45, 1), np.nan) for name in ("velocity_std", "phase_std")}
-    data = dataclasses.replace(doubted.data, force_std=np.full(45, np.nan), **silent)
-    write_plan(tmp_path / "plan.csv", measurement_plan(dataclasses.replace(doubted, data=data)))
+    data = dataclasses.replace(ambiguous.data, force_std=np.full(45, np.nan), **silent)
+    write_plan(tmp_path / "plan.csv", measurement_plan(dataclasses.replace(ambiguous, data=data)))
     with (tmp_path / "plan.csv").open(newline="") as file:
         (header, *rows) = csv.reader(file)
     assert [name for name in header if "std" in name] == ["harmonic_std_m_s"]
     assert len(rows) == 9
 
 
-def test_nothing_open_has_no_plan(doubted):
+def test_a_decided_answer_has_no_plan(ambiguous):
     for verdict in (sj.diagnose.Verdict.NAMED, sj.diagnose.Verdict.NOISE_REJECTED):
-        assert measurement_plan(dataclasses.replace(doubted, verdict=verdict)) is None
-    assert measurement_plan(dataclasses.replace(doubted, recommended=None)) is None
+        assert measurement_plan(dataclasses.replace(ambiguous, verdict=verdict)) is None
+    assert measurement_plan(dataclasses.replace(ambiguous, recommended=None)) is None
 
 
-def test_a_plan_is_in_volts_where_the_test_was(doubted, tmp_path):
+def test_a_plan_is_in_volts_where_the_test_was(ambiguous, tmp_path):
     """0.5 V for a newton; what was filled in joins the states of the first test, not others."""
-    volts = dataclasses.replace(doubted.data, drive=0.5 * doubted.data.force)
-    plan = measurement_plan(dataclasses.replace(doubted, data=volts))
+    volts = dataclasses.replace(ambiguous.data, drive=0.5 * ambiguous.data.force)
+    plan = measurement_plan(dataclasses.replace(ambiguous, data=volts))
     write_plan(tmp_path / "plan.csv", plan)
     with (tmp_path / "plan.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert "force_n" not in rows[0]
     assert "force_std_n" not in rows[0]
-    said = [float(row["drive_v"]) for row in rows]
-    np.testing.assert_allclose(said, 0.5 * np.asarray(plan.states.force), rtol=1e-5)
+    volts_written = [float(row["drive_v"]) for row in rows]
+    np.testing.assert_allclose(volts_written, 0.5 * np.asarray(plan.states.force), rtol=1e-5)
     for row in rows:
         row.update((name, "0.001") for name, text in row.items() if text == "")
     with (tmp_path / "plan.csv").open("w", newline="") as file:
@@ -266,9 +268,9 @@ def test_a_plan_is_in_volts_where_the_test_was(doubted, tmp_path):
         writer.writeheader()
         writer.writerows(rows)
     with pytest.raises(ValueError, match=r"must have the column `force_n`.*plan.csv has `drive_v`"):
-        read_further_states(tmp_path / "plan.csv", balanced_model(), doubted.data)
+        read_further_states(tmp_path / "plan.csv", balanced_model(), ambiguous.data)
     joined = read_further_states(tmp_path / "plan.csv", balanced_model(), volts)
-    assert joined.n_states == doubted.data.n_states + len(rows)
+    assert joined.n_states == ambiguous.data.n_states + len(rows)
     assert joined.harmonic_order == (2, 3)
     recorded = np.isfinite(np.asarray(joined.harmonics)).all(axis=(1, 2))
-    np.testing.assert_array_equal(recorded, np.arange(joined.n_states) >= doubted.data.n_states)
+    np.testing.assert_array_equal(recorded, np.arange(joined.n_states) >= ambiguous.data.n_states)

@@ -1,4 +1,4 @@
-"""Responses that models predict for a test, against closed forms of a linear mode."""
+"""Responses predicted by models for a test, against closed forms of a linear mode."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
     PhaseResonance,
-    holds_response,
+    is_response_controlled,
     level_forces,
     measured_resonance,
     predicted_levels,
@@ -30,7 +30,7 @@ FEW = ("one_sided_stop", "quadratic_damping", "force_gain_error", "residual_mode
 
 
 def linear():
-    """One mode, driven and seen at the same place."""
+    """One mode with collocated force and sensor."""
     modes = sj.model.linear_modes([OMEGA], [ZETA], [[SHAPE]], [SHAPE])
     return sj.model.structure(modes)
 
@@ -62,7 +62,7 @@ def test_resonances_of_a_linear_mode_are_its_own():
 
 @pytest.mark.long
 @pytest.mark.parametrize("kinds", [FEW, tuple(EFFECTS)])
-def test_without_strength_no_kind_counts(kinds):
+def test_without_strength_no_kind_has_an_effect(kinds):
     model, data = linear(), states(linear())
     same = with_idle_effects(model, kinds)
     assert [effect.kind for effect in same.effects] == list(kinds)
@@ -72,7 +72,7 @@ def test_without_strength_no_kind_counts(kinds):
         assert found.velocity == pytest.approx(SHAPE**2 * force / (2 * ZETA * OMEGA), rel=1e-9)
 
 
-def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
+def test_one_program_simulates_before_after_and_withheld_levels():
     model, data = linear(), states(linear())
     # ζ + Δ: at resonance the velocity is ζ/(ζ + Δ) of what it was.
     doubled, tripled = (
@@ -89,7 +89,7 @@ def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
         tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
         assert row.before.velocity == pytest.approx(tip, rel=1e-9)
         assert row.after.velocity == pytest.approx(tip / factor, rel=1e-9)
-        assert row.completed.velocity == pytest.approx(tip / 2.0, rel=1e-9)  # seen or not
+        assert row.completed.velocity == pytest.approx(tip / 2.0, rel=1e-9)  # withheld or not
     louder = predicted_levels(model, doubled, data, 0, force_gain=1.5).levels
     for row, same in zip(louder, rows, strict=True):
         assert row.before.velocity == pytest.approx(same.before.velocity, rel=1e-9)
@@ -98,7 +98,7 @@ def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
 
 
 def test_responses_are_those_that_instruments_record():
-    """A force and a velocity of the mode become others; in phase they are elsewhere."""
+    """Instrument errors change force and velocity, and shift the phase resonance."""
     chain = (
         make_effect("force_gain_error", {"gain": 0.2}),
         make_effect("force_offset_error", {"offset": 0.3}),
@@ -115,8 +115,8 @@ def test_responses_are_those_that_instruments_record():
         q = SHAPE * acting / (OMEGA**2 - at**2 + 2j * ZETA * OMEGA * at)
         own = 1j * at * SHAPE * q
         assert np.degrees(np.angle(own)) == pytest.approx(-5.0, abs=0.02)
-        size = abs(own) * (1 + 1e4 * abs(q) ** 2) * 1.1
-        assert seen.velocity == pytest.approx(size, rel=1e-3)
+        speed = abs(own) * (1 + 1e4 * abs(q) ** 2) * 1.1
+        assert seen.velocity == pytest.approx(speed, rel=1e-3)
 
 
 def test_a_level_on_one_side_of_resonance_has_no_measured_one():
@@ -130,7 +130,7 @@ def jumped(n, early):
 
 @pytest.mark.parametrize("n", [16, 30, 100])
 def test_across_a_jump_no_resonance_was_measured(n):
-    """A sweep that falls 1 % below the phase resonance, by far before the fold."""
+    """A sweep that jumps down 1 % below the phase resonance, well before the fold."""
     data = jumped(n, 0.01)
     found = measured_resonance(data, 0, 0)
     assert np.isnan(found.frequency)
@@ -145,7 +145,7 @@ def test_across_a_jump_no_resonance_was_measured(n):
 
 @pytest.mark.parametrize("n", [40, 80, 160])
 def test_where_the_states_reach_resonance_before_they_fall_it_is_measured(n):
-    """It falls at the fold, 0.05 % above the resonance: enclosed by few states or by none."""
+    """It jumps at the fold, 0.05 % above the resonance: bracketed by few states or none."""
     found = measured_resonance(jumped(n, 0.0), 0, 0)
     resonance = np.sqrt(one_mode.OMEGA**2 + 0.75 * one_mode.STEEP) / (2 * np.pi)
     spacing = 0.3 * 60 / (n - 1)  # Hz
@@ -159,29 +159,29 @@ def test_coarse_states_of_one_branch_are_no_jump():
     assert found.frequency == pytest.approx(50.0, rel=1e-4)
 
 
-def test_a_jump_past_a_resonance_is_said_in_its_place():
+def test_a_jump_past_a_resonance_is_reported_instead():
     nothing = PhaseResonance(np.nan, np.nan, jump=(61.8, 62.1))
-    assert "jump past it, 61.8" in resonance_in_words(nothing, unit_for([1.0], "m/s"))
+    assert "jump over it, 61.8" in resonance_in_words(nothing, unit_for([1.0], "m/s"))
 
 
-def test_a_force_that_drops_at_resonance_holds_no_response():
+def test_a_force_that_drops_at_resonance_is_no_response_control():
     data = states(linear(), (-60.0, -40.0, -15.0, 15.0, 40.0, 60.0))
     row = LevelResponse(0, FORCES[0], *(3 * [PhaseResonance(50.0, 1.0)]), False)
     rows = [row, row._replace(level=1, force=FORCES[1])]
-    assert not holds_response(data, rows)
+    assert not is_response_controlled(data, rows)
     cosine, force = np.cos(np.angle(np.asarray(data.velocity)[:, 0])), np.asarray(data.force)
     drops = eqx.tree_at(lambda d: d.force, data, data.force * (1 - 0.3 * cosine))
-    assert not holds_response(drops, rows)
-    held = eqx.tree_at(
+    assert not is_response_controlled(drops, rows)
+    controlled = eqx.tree_at(
         lambda d: (d.force, d.velocity),
         data,
         (data.force / cosine, data.velocity / cosine[:, None]),
     )
-    assert holds_response(held, rows)
+    assert is_response_controlled(controlled, rows)
     # At phase resonance, with a damping that grows with the amplitude, both change.
     speed = np.geomspace(1.0, 30.0, len(force))
     ladder = eqx.tree_at(lambda d: (d.force, d.velocity), data, (speed**1.2, speed[:, None] + 0j))
-    assert not holds_response(ladder, rows)
+    assert not is_response_controlled(ladder, rows)
 
 
 def test_of_many_levels_some_are_simulated_from_the_smallest_to_the_largest_force():
@@ -196,9 +196,9 @@ def test_of_many_levels_some_are_simulated_from_the_smallest_to_the_largest_forc
 
 def test_the_force_of_a_level_is_that_at_its_resonance():
     data = states(linear(), (-40.0, -10.0, 10.0, 40.0))
-    # Holding the response takes more force away from resonance.
-    held = data.force * np.tile([1.4, 1.1, 1.1, 1.4], len(FORCES))
-    found = level_forces(eqx.tree_at(lambda d: d.force, data, held))
+    # Response control requires more force off resonance.
+    controlled = data.force * np.tile([1.4, 1.1, 1.1, 1.4], len(FORCES))
+    found = level_forces(eqx.tree_at(lambda d: d.force, data, controlled))
     assert found == pytest.approx({0: 1.1 * FORCES[0], 1: 1.1 * FORCES[1]})
     aside = states(linear(), (10.0, 40.0))
     assert level_forces(aside) == pytest.approx(dict(enumerate(FORCES)))
@@ -219,13 +219,13 @@ def test_without_phases_a_resonance_is_the_largest_velocity_over_force():
         tip = SHAPE**2 * force / (2 * ZETA * OMEGA)
         assert found.velocity == pytest.approx(tip * np.cos(np.radians(5)), rel=1e-9)
         assert found.frequency == pytest.approx(OMEGA / (2 * np.pi), rel=1e-3)
-    # One side alone says nothing of where the resonance is.
+    # States on one side do not determine the resonance.
     side = states(model, phases=(10.0, 30.0, 50.0))
     side = dataclasses.replace(side, phase_std=np.full(side.velocity.shape, np.pi))
     assert np.isnan(measured_resonance(side, 0, 0).frequency)
 
 
-def test_a_response_that_ends_early_is_said(monkeypatch):
+def test_a_response_that_ends_early_is_reported(monkeypatch):
     model, data = linear(), states(linear())
     damped = make_effect("linear_damping_change", {"damping_ratio_change": ZETA})
     doubled = dataclasses.replace(model, effects=(damped,))

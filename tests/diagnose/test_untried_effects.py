@@ -1,4 +1,4 @@
-"""No effect of the library stays untried where nobody states the noise."""
+"""All effects of the library are tried where the noise is not stated."""
 
 import pytest
 from truths.one_mode import (
@@ -13,7 +13,7 @@ import snrmjax as sj
 
 
 @pytest.mark.long
-def test_three_effects_are_found_beside_a_linear_test_that_friction_has_bent(tmp_path):
+def test_three_effects_are_found_with_a_linear_test_biased_by_friction(tmp_path):
     """A low level has 0.85 % of damping, half of it friction's, and a modal mass 4 % too large."""
     shape = (1.04 * RUBBING_MASS) ** -0.5
     path = tmp_path / "model.toml"

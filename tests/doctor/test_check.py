@@ -1,4 +1,4 @@
-"""The import doctor on the exact responses of one mode, each with one thing gone wrong."""
+"""The import doctor on the exact responses of one mode, each with one error."""
 
 import json
 
@@ -17,7 +17,7 @@ def wrapped(v):
 
 
 def unsettled(level, v, left=0.5):
-    """A share of the state before, as at exact resonance."""
+    """States with a fraction of the previous one, as at exact resonance."""
     out = v.copy()
     for k in range(1, len(v)):
         if level[k] == level[k - 1]:
@@ -30,10 +30,10 @@ def drifting(w):
 
 
 def clipped(v, limit):
-    """First harmonic of a sine cut off, by its integral over a cycle."""
-    turn = 2 * np.pi * (np.arange(720) + 0.5) / 720
-    wave = np.clip(np.abs(v)[:, None] * np.cos(turn), -limit, limit)
-    return 2 * np.mean(wave * np.cos(turn), axis=1) * np.exp(1j * np.angle(v))
+    """First harmonic of a clipped sine, by its integral over a cycle."""
+    phase = 2 * np.pi * (np.arange(720) + 0.5) / 720
+    wave = np.clip(np.abs(v)[:, None] * np.cos(phase), -limit, limit)
+    return 2 * np.mean(wave * np.cos(phase), axis=1) * np.exp(1j * np.angle(v))
 
 
 def broken(kind, seed=0):
@@ -97,14 +97,16 @@ KINDS = (
 )
 def test_units_that_were_mixed_up_come_first(response, force, mixed, correction):
     level, w, f, v = states()
-    found = sj.doctor.check_test(table(level, w, force * f, response * noisy(v)), model()).findings
-    assert [one.kind for one in found] == list(UNIT_FIRST)
-    assert [one.severity for one in found] == ["error", "warning", "warning"]
-    assert mixed in found[0].evidence["units"]
-    first = found[0].corrections[0]
+    findings = sj.doctor.check_test(
+        table(level, w, force * f, response * noisy(v)), model()
+    ).findings
+    assert [one.kind for one in findings] == list(UNIT_FIRST)
+    assert [one.severity for one in findings] == ["error", "warning", "warning"]
+    assert mixed in findings[0].evidence["units"]
+    first = findings[0].corrections[0]
     assert (first.unit, first.force_unit) == correction
     assert first.response / first.force * response / force == pytest.approx(1, rel=1e-5)
-    assert all(one.evidence["scale"].kind == "if_units_are_right" for one in found[1:])
+    assert all(one.evidence["scale"].kind == "if_units_are_right" for one in findings[1:])
 
 
 UNIT_FIRST = ("wrong_unit", "volts_as_force", "shape_not_mass_normalised")
@@ -113,22 +115,22 @@ UNIT_FIRST = ("wrong_unit", "volts_as_force", "shape_not_mass_normalised")
 @pytest.mark.parametrize("factor", [0.55, 0.75 / 9.80665, 700])
 def test_a_factor_between_no_units_is_none_of_theirs(factor):
     level, w, force, v = states()
-    found = sj.doctor.check_test(table(level, w, force, factor * noisy(v)), model())
-    assert found.kinds == UNIT_FIRST[1:]
+    checkup = sj.doctor.check_test(table(level, w, force, factor * noisy(v)), model())
+    assert checkup.kinds == UNIT_FIRST[1:]
 
 
-def test_a_potential_that_agrees_speaks_for_the_force():
-    """¾γa² of the model's own cubic spring, 3.7 % of the frequency: the response has its size."""
+def test_a_potential_that_agrees_points_to_the_force():
+    """¾γa² of the model's own cubic spring, 3.7 % of the frequency: the response is right."""
     level, w, force, v = states()
     cubic = sj.model.polynomial_potential({"1111": CUBIC / 4}, 1)
     structure = sj.model.structure(model().modes, cubic)
-    found = sj.doctor.check_test(table(level, w, force * 1e-3, noisy(v)), structure)
-    assert found.kinds == UNIT_FIRST[:2]
-    assert {column for column, *_ in found.findings[0].evidence["units"]} == {"force"}
+    checkup = sj.doctor.check_test(table(level, w, force * 1e-3, noisy(v)), structure)
+    assert checkup.kinds == UNIT_FIRST[:2]
+    assert {column for column, *_ in checkup.findings[0].evidence["units"]} == {"force"}
 
 
-def raised(found):
-    return [one.kind for one in found.findings if one.severity != "info"]
+def raised(checkup):
+    return [one.kind for one in checkup.findings if one.severity != "info"]
 
 
 SLOW = {"volts_as_force", "clipped_channel", "unsettled_steps", "degrees_for_radians"}
@@ -137,30 +139,30 @@ SLOW = {"volts_as_force", "clipped_channel", "unsettled_steps", "degrees_for_rad
 @pytest.mark.parametrize(
     "kind", [pytest.param(k, marks=pytest.mark.long) if k in SLOW else k for k in KINDS]
 )
-def test_each_error_of_a_table_is_found_and_named_alone(kind):
+def test_each_error_of_a_table_is_reported_alone(kind):
     data, structure = broken(kind)
-    found = sj.doctor.check_test(data, structure)
-    assert raised(found) == [kind]
-    (row,) = found.to_xarray().kind.values
+    checkup = sj.doctor.check_test(data, structure)
+    assert raised(checkup) == [kind]
+    (row,) = checkup.to_xarray().kind.values
     assert row == kind
-    assert kind in repr(found)
+    assert kind in repr(checkup)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_other_noise_changes_no_answer(kind):
+def test_other_noise_changes_no_finding(kind):
     for seed in (1, 2, 3):
         assert raised(sj.doctor.check_test(*broken(kind, seed))) == [kind]
 
 
 @pytest.mark.long
-def test_good_tables_are_silent_whatever_their_noise():
+def test_good_tables_have_no_findings_with_any_noise():
     level, w, force, exact = states()
     for seed in range(3, 40):
         assert sj.doctor.check_test(table(level, w, force, noisy(exact, seed)), model()).kinds == ()
 
 
-def test_good_tables_are_silent():
+def test_good_tables_have_no_findings():
     level, w, force, exact = states()
     for seed in range(2):
         assert sj.doctor.check_test(table(level, w, force, noisy(exact, seed)), model()).kinds == ()
@@ -168,21 +170,21 @@ def test_good_tables_are_silent():
 
 @pytest.mark.long
 @pytest.mark.parametrize("ratio", [1.04, 0.5])
-def test_files_of_two_structures_are_told_apart(ratio):
+def test_files_of_two_structures_are_distinguished(ratio):
     tests = []
     for seed, one in enumerate((1.0, ratio)):
         level, w, force, exact = states(ratio=one)
         tests.append(table(level, w, force, noisy(exact, seed)))
-    found = sj.doctor.check_test(tests, model())
-    assert raised(found) == ["different_structures"]
-    assert abs(found.findings[0].evidence["change"] - (ratio - 1)) < 0.002
+    checkup = sj.doctor.check_test(tests, model())
+    assert raised(checkup) == ["different_structures"]
+    assert abs(checkup.findings[0].evidence["change"] - (ratio - 1)) < 0.002
     level, w, force, exact = states()
     tests[1] = table(level, w, force, noisy(exact, 5))
     assert sj.doctor.check_test(tests, model()).kinds == ()
 
 
-def test_friction_is_no_wrong_scale_of_forces():
-    """Damping that falls as 1/a, exactly: without a model no force looks like volts for it."""
+def test_friction_is_not_a_wrong_force_scale():
+    """Damping that falls as 1/a, exactly: without a model this must not look like volts."""
     assert sj.doctor.check_test(rubbing_test(3)).kinds == ()
 
 
@@ -202,7 +204,7 @@ def harmonic_table(ratio):
     return table(level, w, force, noisy(v), **more)
 
 
-def test_harmonics_of_the_force_are_told_from_those_of_the_structure():
+def test_harmonics_of_the_force_and_of_the_structure_are_distinguished():
     assert raised(sj.doctor.check_test(harmonic_table(0.15), model())) == ["force_harmonics"]
     assert sj.doctor.check_test(harmonic_table(0.0), model()).kinds == ()
 
@@ -211,19 +213,19 @@ def record(kind="", dwell=1.0, rate=1500.0):
     """Five steps over the resonance of one mode, by scipy's exact step between samples."""
     frequencies = np.linspace(57, 63, 5)
     each = int(dwell * rate)
-    turn = 2 * np.pi * np.cumsum(np.repeat(frequencies, each)) / rate
-    time = np.arange(len(turn)) / rate
-    force = np.cos(turn) + (0.1 * np.cos(3 * turn) if kind == "force_harmonics" else 0.0)
+    phase = 2 * np.pi * np.cumsum(np.repeat(frequencies, each)) / rate
+    time = np.arange(len(phase)) / rate
+    force = np.cos(phase) + (0.1 * np.cos(3 * phase) if kind == "force_harmonics" else 0.0)
     if kind == "force_dropout":
         force = force * np.repeat([1.0, 0.9, 0.4, 0.9, 1.0], each)
     v = lsim(([1, 0], [1, 2 * ZETA * OMEGA, OMEGA**2]), force, time)[1]
-    size = np.abs(v).max()
+    largest = np.abs(v).max()
     if kind == "missing_anti_alias":
-        v = v + 0.02 * size * np.cos(23 * turn)  # above half the rate: folded by sampling
+        v = v + 0.02 * largest * np.cos(23 * phase)  # above half the rate: aliased by sampling
     rng = np.random.default_rng(0)
-    v = v + 1e-3 * size * rng.normal(size=len(v))
+    v = v + 1e-3 * largest * rng.normal(size=len(v))
     if kind == "clipped_channel":
-        v = np.clip(v, -0.6 * size, 0.6 * size)
+        v = np.clip(v, -0.6 * largest, 0.6 * largest)
     channels = [Channel("cell", "force", "N"), Channel("tip", "velocity", "m/s")]
     return time_recording(np.stack([force, v]), channels, rate)
 
@@ -232,7 +234,7 @@ RECORDS = ("force_harmonics", "force_dropout", "missing_anti_alias", "clipped_ch
 
 
 @pytest.mark.parametrize("kind", RECORDS)
-def test_each_error_of_a_record_is_found_and_named_alone(kind):
+def test_each_error_of_a_record_is_reported_alone(kind):
     assert set(raised(sj.doctor.check_test([], None, [record(kind)]))) == {kind}
 
 
@@ -241,7 +243,7 @@ def test_steps_that_end_too_soon():
     assert raised(sj.doctor.check_test([], None, [record(dwell=0.25)])) == ["unsettled_steps"]
 
 
-def test_a_good_record_is_silent():
+def test_a_good_record_has_no_findings():
     assert sj.doctor.check_test([], None, [record()]).kinds == ()
 
 

@@ -1,4 +1,4 @@
-"""What identification says where columns mean something else, on the exact responses of a mode."""
+"""Caveats of an identification with misread columns, on the exact responses of a mode."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.pipelines.identify import identify_test
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-FEW = slice(None, None, 5)  # nine states, three a level, from which no phase can be told wrong
+FEW = slice(None, None, 5)  # nine states, three per level, too few to detect wrong phases
 
 
 def few(change=lambda w, f, v: (f, v), seed=0):
@@ -25,7 +25,7 @@ def few(change=lambda w, f, v: (f, v), seed=0):
 
 
 class Points(NamedTuple):
-    """What `identify_points` finds, by the same balance in a line: Ω² + Re iΩF/(cV), Im /Ω."""
+    """Result of `identify_points`, by the same balance in one line: Ω² + Re iΩF/(cV), Im /Ω."""
 
     level: np.ndarray
     amplitude: np.ndarray
@@ -34,7 +34,7 @@ class Points(NamedTuple):
     usable: np.ndarray
 
 
-def said(data, structure):
+def caveats(data, structure):
     w, v = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]
     balance = 1j * w * np.asarray(data.force) * float(structure.modes.mode_shape[0, 0]) ** 2 / v
     natural = np.sqrt(np.abs(w**2 + balance.real))
@@ -55,7 +55,7 @@ def said(data, structure):
     ],
 )
 def test_a_wrong_unit_or_phase_sign_is_named_with_advice(change, kind, named):
-    (note,) = said(few(change), model())
+    (note,) = caveats(few(change), model())
     evidence = note["evidence"]
     assert (note.kind, evidence.kind) == ("column_misread", kind)
     assert named in (evidence.get("reading"), evidence.get("column"), *evidence.get("units", ()))
@@ -64,33 +64,33 @@ def test_a_wrong_unit_or_phase_sign_is_named_with_advice(change, kind, named):
 
 
 @pytest.mark.parametrize("factor", [9.80665, 1e-3, 1 / 4.4482216])
-def test_the_size_is_that_of_the_mixed_units(factor):
-    (note,) = said(few(lambda w, f, v: (f, v / factor)), model())
+def test_the_factor_is_that_of_the_mixed_units(factor):
+    (note,) = caveats(few(lambda w, f, v: (f, v / factor)), model())
     evidence = note["evidence"]
     # 4σ: one in 16000 by chance
     assert abs(evidence["ratio"] - factor) < 4 * evidence["ratio_std"] < 0.04 * factor
 
 
-def test_good_states_are_silent():
+def test_good_states_have_no_caveat():
     for seed in range(3):
-        assert said(few(seed=seed), model()) == ()
+        assert caveats(few(seed=seed), model()) == ()
 
 
-def test_what_identification_says_of_phases_is_not_said_twice():
+def test_wrong_phases_are_not_reported_twice():
     level, w, f, v = states()
     data = table(level, w, f, noisy(v).conj())
     assert wrong_phases(data, model())[0]["conjugated"]
     assert caveat(data, model()) == ()
 
 
-def test_another_assembly_is_doubted():
+def test_another_assembly_is_reported():
     """1 % of the frequency is a linear test's error; 20 % and five times the damping are not."""
 
     def other(frequency, damping):
         modes = sj.model.linear_modes(
             [frequency * OMEGA], [damping * ZETA], [[SHAPE]], [SHAPE], sensors=("tip",)
         )
-        return said(few(), sj.model.structure(modes))
+        return caveats(few(), sj.model.structure(modes))
 
     assert other(1.01, 1.2) == ()
     (note,) = other(1.2, 0.2)
@@ -106,10 +106,10 @@ def test_few_states_and_voltages_are_left_alone():
     assert caveat(driven, model()) == ()
 
 
-def test_an_error_of_identification_says_why():
+def test_an_error_of_identification_has_its_cause():
     data = few(lambda w, f, v: (f, v / (1j * w)))
-    told = str(with_caveat(ValueError("no points."), data, model()))
-    assert told.startswith("no points. the responses are displacements")
+    message = str(with_caveat(ValueError("no points."), data, model()))
+    assert message.startswith("no points. the responses are displacements")
     assert str(with_caveat(ValueError("no points."), few(), model())) == "no points."
 
 
@@ -122,14 +122,14 @@ def test_damping_at_rest_is_compared_with_the_linear_tests(monkeypatch):
         linear = eqx.tree_at(lambda m: m.modes.damping_ratio_std, model(), np.array([own]))
         return linear_damping_note(None, linear)
 
-    (said_so,) = note(0.022, 5e-4)
-    assert said_so["apart"] == pytest.approx(0.002 / np.hypot(5e-4, 5e-4))
+    (fact,) = note(0.022, 5e-4)
+    assert fact["apart"] == pytest.approx(0.002 / np.hypot(5e-4, 5e-4))
     assert note(0.021, 5e-4) == ()
     assert note(0.022, 0.0) == note(0.022, np.nan) == note(np.nan, 5e-4) == ()
 
 
 @pytest.mark.long
-def test_an_identification_without_points_says_why():
+def test_an_identification_without_points_reports_the_cause():
     data = few(lambda w, f, v: (f, v / (1j * w)))
     with pytest.raises(ValueError, match=r"no real natural frequency.*as displacements"):
         identify_test(data, model())
@@ -138,8 +138,8 @@ def test_an_identification_without_points_says_why():
 @pytest.mark.long
 def test_the_note_comes_first():
     data = few(lambda w, f, v: (f, v / 9.80665))
-    found = identify_test(data, model())
-    assert found.notes[0] == said(data, model())[0]
+    result = identify_test(data, model())
+    assert result.notes[0] == caveats(data, model())[0]
 
 
 @pytest.mark.long
@@ -147,7 +147,7 @@ def test_the_note_comes_first():
 def test_measured_beams_are_silent(name):
     folder = DATA / "brake_reuss_beam"
     if not folder.exists():
-        pytest.skip("the measured data are not beside the project, in ../shared/data")
+        pytest.skip("the measured data are not in ../shared/data")
     structure = sj.read_model(folder / "model.toml")
     data = sj.read_steady_states(folder / f"{name}.csv", structure)
-    assert said(data, structure) == ()
+    assert caveats(data, structure) == ()

@@ -1,4 +1,4 @@
-"""Drifts and what passes for one: exact states of a softening mode that is swept up, then down."""
+"""Drifts and confounders: exact states of a softening mode that is swept up, then down."""
 
 import numpy as np
 import pytest
@@ -49,10 +49,10 @@ def table(level, w, force, v):
 
 
 @pytest.mark.parametrize("again", [False, True])
-def test_what_every_level_begins_anew_is_no_drift(again):
+def test_a_change_that_restarts_with_each_level_is_no_drift(again):
     """Down-sweeps lower by 5 % of a bandwidth in every level: 0.5 % of it is the noise of one."""
-    found = sj.doctor.check_test(table(*swept(lower=0.05, again=again)), model())
-    assert found.kinds == ()
+    checkup = sj.doctor.check_test(table(*swept(lower=0.05, again=again)), model())
+    assert checkup.kinds == ()
 
 
 def test_softening_with_rising_levels_is_no_drift():
@@ -60,14 +60,14 @@ def test_softening_with_rising_levels_is_no_drift():
 
 
 @pytest.mark.parametrize("drift", [2.0, -2.0])
-def test_a_drift_through_all_sweeps_is_named_with_its_size(drift):
+def test_a_drift_through_all_sweeps_is_reported_with_its_magnitude(drift):
     (one,) = sj.doctor.check_test(table(*swept(drift=drift)), model()).findings
     assert one.kind == "drift"
-    # Levels' own mean is free: of ten sweeps the change is told to a tenth.
+    # Levels' own mean is free: ten sweeps determine the change to a tenth.
     assert one.evidence["change"] == pytest.approx(drift * BANDWIDTH, rel=0.15)
 
 
-def test_sweeps_are_told_by_the_frequencys_direction():
+def test_sweeps_are_separated_by_the_direction_of_frequency():
     level = np.repeat([0, 1, 2], 8)
     frequency = np.array([1, 2, 3, 4, 4, 3, 2, 1.0, *range(4), *range(4), 1, 5, 2, 6, 3, 7, 4, 8])
     sweep, rising = sweeps(level, frequency, np.arange(24.0))

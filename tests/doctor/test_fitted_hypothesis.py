@@ -1,4 +1,4 @@
-"""Evidence of readings on the exact responses of one mode."""
+"""Evidence of interpretations on the exact responses of one mode."""
 
 import numpy as np
 import pytest
@@ -16,11 +16,11 @@ def checked():
 
 def test_the_misfit_of_right_states_is_their_noise():
     """0.3 % of 45 states; curves and levels cost some 60 % more of so few."""
-    judged = fit_hypothesis(checked().test)
-    assert judged.noise == pytest.approx(0.003, rel=0.25)  # of 90 numbers, some 20 of them used up
-    assert 0.003 < judged.misfit < 0.006
-    assert judged.fits
-    assert judged.fraction > 0.5  # white noise: neighbours of 45 states agree by chance at most so
+    fit = fit_hypothesis(checked().test)
+    assert fit.noise == pytest.approx(0.003, rel=0.25)  # from 90 values less some 20 unknowns
+    assert 0.003 < fit.misfit < 0.006
+    assert fit.fits
+    assert fit.fraction > 0.5  # white noise: chance correlation of neighbours among 45 states
 
 
 def test_evidence_does_not_depend_on_units():
@@ -34,14 +34,14 @@ def test_evidence_does_not_depend_on_units():
 
 
 def test_conjugated_phasors_do_not_fit_the_models_mass_and_their_conjugates_do():
-    seen = checked()
-    wrong = fit_hypothesis(seen.read(seen.recorded.conj()))
-    assert fit_hypothesis(seen.test).beats(wrong)
-    assert not wrong.beats(fit_hypothesis(seen.test))
+    states = checked()
+    wrong = fit_hypothesis(states.read(states.recorded.conj()))
+    assert fit_hypothesis(states.test).beats(wrong)
+    assert not wrong.beats(fit_hypothesis(states.test))
 
 
 @pytest.mark.parametrize("factor", [1.37, 300.0, 0.004])
-def test_a_wrong_scale_is_found_again(factor):
+def test_a_wrong_scale_is_recovered(factor):
     scale = any_mass(with_mass(checked().test, 1 / factor))
     assert abs(np.log(scale.mass / factor)) < 4 * scale.std  # 4σ: one in 16000 by chance
     assert scale.std < 0.01
@@ -59,37 +59,37 @@ def test_a_fit_pays_for_a_mode_far_from_the_linear_tests():
     assert paid == pytest.approx(2.5, abs=0.15)  # K is 0.3 % above ω² and δ within 3 %
 
 
-def test_a_fit_that_goes_on_finds_what_a_new_one_does():
+def test_a_restarted_fit_agrees_with_a_new_one():
     """Forces 3 % larger at one level, from the fit without."""
     states = checked().test
     moved = states._replace(force=states.force * np.where(states.level == 1, 1.03, 1.0))
     again = fit_hypothesis(moved, start=fit_hypothesis(states))
     anew = fit_hypothesis(moved, rounds=12)
     assert again.evidence == pytest.approx(anew.evidence, abs=3.0)  # of 12 that decide
-    assert again.noise == pytest.approx(anew.noise, rel=0.07)  # 90 numbers tell it so
+    assert again.noise == pytest.approx(anew.noise, rel=0.07)  # known so from 90 values
 
 
-def test_a_trend_that_is_nothing_costs_its_prior_and_no_more():
-    """What is freer and begins where the fit without it ended cannot explain less.
+def test_a_zero_trend_costs_only_its_prior():
+    """A model with more unknowns, started from the fit without, cannot fit worse.
 
-    ln of the prior's 1σ over what the states leave of it, some 4, is all that it pays.
+    Its only cost is ln of the prior 1σ over the posterior 1σ, some 4.
     """
-    seen = checked()
-    base = fit_hypothesis(seen.test)
-    drift = next(iter(corrections(seen, seen.test, base)))
+    states = checked()
+    base = fit_hypothesis(states.test)
+    drift = next(iter(corrections(states, states.test, base)))
     assert drift.kind == "drift"
-    _, left = drift.judged.posterior.trend
-    paid = base.evidence - drift.judged.evidence
+    _, left = drift.fit.posterior.trend
+    paid = base.evidence - drift.fit.evidence
     assert paid == pytest.approx(np.log(MOVES / left), abs=2.5)  # a chance of 5 σ²/2 in it
 
 
-def test_values_that_are_tried_share_the_odds():
-    """Of eight values that change nothing each is the table itself, and one in eight."""
+def test_trial_values_share_the_prior():
+    """Eight values without effect: each is the table itself, with prior probability 1/8."""
     states = checked().test
     base = fit_hypothesis(states)
     fits = [base]
     for _ in range(8):
         fits.append(fit_hypothesis(states, start=fits[-1]))
-    _, found = likeliest(base, [Tried(float(k), states) for k in range(8)])
+    _, fit = likeliest(base, [Tried(float(k), states) for k in range(8)])
     best = max(one.evidence for one in fits[1:])
-    assert found.evidence == pytest.approx(best - np.log(8), abs=1e-6)  # the same fits
+    assert fit.evidence == pytest.approx(best - np.log(8), abs=1e-6)  # the same fits

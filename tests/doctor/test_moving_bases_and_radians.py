@@ -1,39 +1,39 @@
-"""The motion of a base that was or was not taken away, and phases in radians of accelerations."""
+"""Base motion subtracted or not, and phases in radians of accelerations."""
 
 import numpy as np
 import pytest
 from truths.one_mode import OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
-from snrmjax.measure.base_excitation import seen_from_base
-from snrmjax.model.modes import Beside
+from snrmjax.measure.base_excitation import relative_to_base
+from snrmjax.model.modes import OptionalModalData
 from snrmjax.model.moving_base import base_motion
 
 
-def on_a_base(recorded, said, seed=0):
+def on_a_base(recorded, declared, seed=0):
     """States of three levels on a base, absolute or relative as they were recorded.
 
-    The exact states of `truths.one_mode` with the base's acceleration in the place of −F: the
-    absolute motion is that relative to the base and the base's own.
+    The exact states of `truths.one_mode` with the base acceleration in place of −F: the
+    absolute motion is the sum of relative and base motion.
     """
     level, w, force, v = states()
     acceleration, relative = force, -v  # Γ is the participation
     own = acceleration / (1j * w)
-    seen = noisy(relative + own if recorded == "absolute" else relative, seed)
-    data = table(level, w, acceleration, seen)
+    measured = noisy(relative + own if recorded == "absolute" else relative, seed)
+    data = table(level, w, acceleration, measured)
     modes = sj.model.linear_modes(
         [OMEGA],
         [ZETA],
         [[SHAPE]],
         [-SHAPE],
         sensors=("tip",),
-        beside=Beside(base=base_motion(said)),
+        beside=OptionalModalData(base=base_motion(declared)),
     )
-    return seen_from_base(data, modes.base), sj.model.structure(modes)
+    return relative_to_base(data, modes.base), sj.model.structure(modes)
 
 
 @pytest.mark.parametrize(
-    ("recorded", "said", "kinds"),
+    ("recorded", "declared", "kinds"),
     [
         ("absolute", "absolute", ()),
         ("relative", "relative", ()),
@@ -41,11 +41,11 @@ def on_a_base(recorded, said, seed=0):
         ("relative", "absolute", ("motion_of_base",)),
     ],
 )
-def test_a_base_whose_motion_was_not_taken_away_is_found(recorded, said, kinds):
-    found = sj.doctor.check_test(*on_a_base(recorded, said))
-    assert found.kinds == kinds
+def test_a_wrong_declaration_of_base_motion_is_reported(recorded, declared, kinds):
+    checkup = sj.doctor.check_test(*on_a_base(recorded, declared))
+    assert checkup.kinds == kinds
     if kinds:
-        assert f'motion = "{recorded}"' in str(found.findings[0].advice)
+        assert f'motion = "{recorded}"' in str(checkup.findings[0].advice)
 
 
 @pytest.mark.parametrize(
@@ -56,6 +56,6 @@ def test_phases_in_radians_of_any_motion_that_were_read_as_degrees(lead):
     v = noisy(exact)
     stated = np.angle(v * np.exp(1j * lead))
     read = np.abs(v) * np.exp(1j * (np.radians(stated) - lead))
-    found = sj.doctor.check_test(table(level, w, force, read), model())
-    assert found.kinds == ("degrees_for_radians",)
-    assert found.findings[0].corrections[0].phase_unit == "rad"
+    checkup = sj.doctor.check_test(table(level, w, force, read), model())
+    assert checkup.kinds == ("degrees_for_radians",)
+    assert checkup.findings[0].corrections[0].phase_unit == "rad"

@@ -1,4 +1,4 @@
-"""The doctor's finer rules: near misses of one mode and its records, by exact responses."""
+"""The doctor's finer rules: borderline cases of one mode and its records, by exact responses."""
 
 import numpy as np
 import pytest
@@ -13,11 +13,11 @@ from snrmjax.measure import Channel, time_recording
 
 
 def raised(data, structure=None, recordings=()):
-    found = sj.doctor.check_test(data, structure, recordings)
-    return [one.kind for one in found.findings if one.severity != "info"]
+    checkup = sj.doctor.check_test(data, structure, recordings)
+    return [one.kind for one in checkup.findings if one.severity != "info"]
 
 
-def test_a_finding_is_as_grave_as_its_kind_unless_something_else_explains_it():
+def test_a_finding_has_the_severity_of_its_kind_without_another_explanation():
     assert set(SEVERITIES) == set(KINDS)
     sure = Finding("volts_as_force", "", "", "")
     assert (sure.severity, sure._replace(unsure=True).severity) == ("error", "warning")
@@ -27,12 +27,12 @@ def test_a_finding_is_as_grave_as_its_kind_unless_something_else_explains_it():
     ("power", "kind"), [(-1, "displacement_as_velocity"), (1, "acceleration_as_velocity")]
 )
 def test_amplitudes_of_another_quantity_over_a_wide_band(power, kind):
-    """The band is 16 % wide: a constant factor in the place of Ω leaves several per cent."""
+    """The band is 16 % wide: a constant factor in place of Ω leaves several per cent."""
     level, w, force, v = states()
     assert np.ptp(w) > 0.15 * OMEGA
-    found = sj.doctor.check_test(table(level, w, force, noisy(v) * w**power), model())
-    assert [one.kind for one in found.findings] == [kind]
-    assert found.findings[0].evidence["reading"].startswith("sizes_of_")
+    checkup = sj.doctor.check_test(table(level, w, force, noisy(v) * w**power), model())
+    assert [one.kind for one in checkup.findings] == [kind]
+    assert checkup.findings[0].evidence["reading"].startswith("sizes_of_")
 
 
 @pytest.mark.parametrize("factor", [0.96, pytest.param(1.04, marks=pytest.mark.long)])
@@ -43,7 +43,7 @@ def test_an_rms_within_the_error_of_the_modal_mass(factor):
     assert raised(table(level, w, factor * force / 2**0.5, noisy(v)), model()) == ["rms_for_peak"]
 
 
-def test_errors_that_were_stated_too_small_hide_no_wrong_scale():
+def test_errors_stated_too_small_do_not_hide_a_wrong_scale():
     """Noise of 0.3 % stated as 0.03 %: the modal mass is known to 1 % all the same."""
     level, w, force, v = states()
     stated = {"velocity_std": 3e-4 * np.abs(v), "phase_std": np.full(len(v), 3e-4)}
@@ -52,10 +52,10 @@ def test_errors_that_were_stated_too_small_hide_no_wrong_scale():
     assert raised(data, model()) == []
 
 
-def test_an_unsure_modal_mass_is_no_wrong_scale():
+def test_an_uncertain_modal_mass_is_no_wrong_scale():
     level, w, force, v = states()
-    seen = checked_states(table(level, w, force, v), model(), 0, np.ones(len(v), dtype=bool))
-    right, wrong = fit_hypothesis(seen.test), fit_hypothesis(with_mass(seen.test, 1.5))
+    recorded = checked_states(table(level, w, force, v), model(), 0, np.ones(len(v), dtype=bool))
+    right, wrong = fit_hypothesis(recorded.test), fit_hypothesis(with_mass(recorded.test, 1.5))
     assert is_other_scale(Scale(right, 1.5, 0.01), wrong)
     assert not is_other_scale(Scale(right, 1.5, 0.2), wrong)  # its 95 % band has 1.01 in it
     # Volts of 4.5 V/N need not be known to 5 % for it.
@@ -63,7 +63,7 @@ def test_an_unsure_modal_mass_is_no_wrong_scale():
     assert not is_other_scale(Scale(right, 1.1, 0.01), wrong)
 
 
-def test_a_sensor_against_the_force_is_wrong_only_where_a_model_says_otherwise():
+def test_a_sensor_against_the_force_is_wrong_only_if_a_model_states_otherwise():
     level, w, force, v = states()
     data = table(level, w, force, -noisy(v))
     assert raised(data) == []
@@ -74,23 +74,25 @@ def test_a_sensor_against_the_force_is_wrong_only_where_a_model_says_otherwise()
 def test_a_level_whose_force_is_off_is_named(off):
     level, w, force, v = states()
     force = force * np.where(level + 1 == off, 1.25, 1.0)
-    found = sj.doctor.check_test(table(level, w, force, noisy(v)), model()).findings
-    (own,) = (one for one in found if one.kind == "volts_as_force")
+    findings = sj.doctor.check_test(table(level, w, force, noisy(v)), model()).findings
+    (own,) = (one for one in findings if one.kind == "volts_as_force")
     ((level, file, gain),) = own.evidence["gains"]
     assert (level, file) == (off, None)
     assert gain == pytest.approx(1.25, rel=0.02)  # 0.3 % of noise, curves that bend
     assert own.advice["gains"] == own.evidence["gains"]
     assert (own.name, own.as_dict()["kind"]) == (
-        f"force on another scale at level {off}",
+        f"different force scale at level {off}",
         "volts_as_force",
     )
 
 
 def test_forces_of_which_no_two_levels_agree_are_listed():
     level, w, force, v = states()
-    seen = table(level, w, force * np.array([1.0, 0.7, 0.5])[level], noisy(v))
+    recorded = table(level, w, force * np.array([1.0, 0.7, 0.5])[level], noisy(v))
     own = next(
-        one for one in sj.doctor.check_test(seen, model()).findings if one.kind == "volts_as_force"
+        one
+        for one in sj.doctor.check_test(recorded, model()).findings
+        if one.kind == "volts_as_force"
     )
     np.testing.assert_allclose(own.evidence["gains"], [0.7, 0.5], rtol=0.03)
     assert own.name == "volts as force"
@@ -103,21 +105,23 @@ def with_damping_std():
     return sj.model.structure(modes)
 
 
-def test_the_shakers_own_damping_tells_a_voltage_from_the_force():
+def test_shaker_damping_reveals_a_voltage_taken_for_the_force():
     """U = F + cV: a coil of (Bl)²/R = c, in units of force, that doubles the damping."""
     level, w, force, v = states()
     drive = force + 2 * ZETA * OMEGA / SHAPE**2 * v
-    seen = noisy(np.abs(v) * np.exp(1j * np.angle(v / drive)))
-    assert raised(table(level, w, np.abs(drive), seen), with_damping_std()) == ["volts_as_force"]
+    recorded = noisy(np.abs(v) * np.exp(1j * np.angle(v / drive)))
+    assert raised(table(level, w, np.abs(drive), recorded), with_damping_std()) == [
+        "volts_as_force"
+    ]
     assert raised(table(level, w, force, noisy(v)), with_damping_std()) == []
     # Damping that grows with the amplitude is the structure's own.
     grows = force + 4 * ZETA * OMEGA / SHAPE**2 * v * np.sqrt(np.abs(v) / np.abs(v).max())
-    seen = noisy(np.abs(v) * np.exp(1j * np.angle(v / grows)))
-    assert raised(table(level, w, np.abs(grows), seen), with_damping_std()) == []
+    recorded = noisy(np.abs(v) * np.exp(1j * np.angle(v / grows)))
+    assert raised(table(level, w, np.abs(grows), recorded), with_damping_std()) == []
 
 
-def held_response(floor, seed=0):
-    """Velocities that are held, the force that this takes, and what a noisy cell reads of it."""
+def controlled_response(floor, seed=0):
+    """Controlled velocities, the force needed, and its reading by a noisy cell."""
     level, w, _, _ = states()
     w = OMEGA * (1 + 0.05 * np.linspace(-1, 1, 15))[np.arange(45) % 15]
     a = np.array([0.3, 0.6, 1.0])[level] * OMEGA / w
@@ -129,13 +133,13 @@ def held_response(floor, seed=0):
 
 
 def test_a_force_that_falls_into_the_noise_of_its_cell():
-    found = sj.doctor.check_test(held_response(0.15), model()).findings
-    assert [one.kind for one in found] == ["force_dropout"]
-    assert found[0].evidence.kind == "force_in_noise"
+    findings = sj.doctor.check_test(controlled_response(0.15), model()).findings
+    assert [one.kind for one in findings] == ["force_dropout"]
+    assert findings[0].evidence.kind == "force_in_noise"
 
 
-def test_a_held_response_with_a_good_cell_is_silent():
-    assert raised(held_response(0.0), model()) == []
+def test_a_controlled_response_with_a_good_cell_has_no_finding():
+    assert raised(controlled_response(0.0), model()) == []
 
 
 FALLEN = (
@@ -186,7 +190,7 @@ def recording(samples, rate):
     )
 
 
-def test_a_limit_that_few_samples_reach():
+def test_a_limit_reached_by_few_samples():
     """17 samples a cycle and a limit of 97 %: one or two at it, never three in a row."""
     samples, rate = stepped_record(150, 0.02, 17, frequencies=5)
     samples[1] = np.clip(samples[1], -0.97, 0.97)
@@ -200,7 +204,7 @@ def test_counts_of_a_digitiser_are_no_limit():
     assert raised([], None, [recording(samples, rate)]) == []
 
 
-def test_transients_that_turn_within_a_few_cycles():
+def test_transients_that_rotate_within_a_few_cycles():
     """22 cycles at ζ = 0.7 %: e^{−2πζ·22} = 38 % of a change is left at the end."""
     assert raised([], None, [recording(*stepped_record(22, 0.007))]) == ["unsettled_steps"]
 

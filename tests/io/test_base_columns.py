@@ -1,10 +1,10 @@
-"""Tables whose structure is moved by its base: what is read, turned, taken away and refused."""
+"""Tables with base excitation: phase reference, subtraction of the base motion, refusals."""
 
 import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.model.modes import Beside
+from snrmjax.model.modes import OptionalModalData
 
 HERTZ = 2 * np.pi
 OWN, RATIO, MASS = 50 * HERTZ, 0.01, 0.4
@@ -19,7 +19,7 @@ def model(motion):
     modes = sj.model.linear_modes(
         *([OWN], [RATIO], [[MASS**-0.5]], [-(MASS**0.5)]),
         sensors=("tip",),
-        beside=Beside(base=base),
+        beside=OptionalModalData(base=base),
     )
     return sj.model.structure(modes)
 
@@ -38,24 +38,24 @@ def table(tmp_path, *, absolute=True, header=HEADER, extra=""):
 
 
 @pytest.mark.parametrize("motion", ["absolute", "relative"])
-def test_the_motion_of_the_base_is_taken_away_where_the_model_says_so(tmp_path, motion):
+def test_the_motion_of_the_base_is_subtracted_for_absolute_sensors(tmp_path, motion):
     path = table(tmp_path, absolute=motion == "absolute")
     data = sj.read_steady_states(path, model(motion))
     np.testing.assert_allclose(data.force, 2.0, rtol=1e-12)
-    found = sj.identify.identify_points(data, model(motion).modes)
-    np.testing.assert_allclose(found.natural_frequency, OWN, rtol=1e-10)
-    np.testing.assert_allclose(found.damping_ratio, RATIO, rtol=1e-7)
+    points = sj.identify.identify_points(data, model(motion).modes)
+    np.testing.assert_allclose(points.natural_frequency, OWN, rtol=1e-10)
+    np.testing.assert_allclose(points.damping_ratio, RATIO, rtol=1e-7)
     assert "base_acceleration_m_s2" in data.to_xarray()
     assert "acceleration of the base 2 to 2 m/s²" in repr(data)
 
 
-def test_errors_turn_with_the_velocity(tmp_path):
+def test_errors_are_rotated_with_the_velocity(tmp_path):
     header = f"{HEADER},velocity_std_m_s,phase_std_deg,base_acceleration_std_m_s2"
     path = table(tmp_path, header=header, extra=",0.001,0,0.02")
     data = sj.read_steady_states(path, model("absolute"))
     recorded = sj.read_steady_states(path)
     across = np.angle(np.asarray(data.velocity) / np.asarray(recorded.velocity))
-    # An error of 1 mm/s along the recorded phasor, seen along and across the relative one.
+    # An error of 1 mm/s along the recorded phasor, resolved along and across the relative one.
     np.testing.assert_allclose(data.velocity_std, 1e-3 * np.abs(np.cos(across)), rtol=1e-9)
     expected = 1e-3 * np.abs(np.sin(across) / np.asarray(data.velocity))
     np.testing.assert_allclose(data.phase_std, expected, rtol=1e-9)
@@ -63,7 +63,7 @@ def test_errors_turn_with_the_velocity(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("motion", "old", "new", "said"),
+    ("motion", "old", "new", "message"),
     [
         (None, "", "", r"the model has no \[base\]"),
         ("absolute", "base_acceleration_im_m_s2", "further", "lacks `base_acceleration_im_m_s2`"),
@@ -77,7 +77,7 @@ def test_errors_turn_with_the_velocity(tmp_path):
         ("absolute", "velocity_re_m_s,velocity_im_m_s", "velocity_m_s,order", "without phases"),
     ],
 )
-def test_what_a_base_table_cannot_be_is_said(tmp_path, motion, old, new, said):
+def test_invalid_base_tables_are_refused(tmp_path, motion, old, new, message):
     path = table(tmp_path, header=HEADER.replace(old, new) if old else HEADER)
     if new == "force_n,":
         text = path.read_text().splitlines()
@@ -86,12 +86,12 @@ def test_what_a_base_table_cannot_be_is_said(tmp_path, motion, old, new, said):
         rows = [row.split(",") for row in path.read_text().splitlines()[1:]]
         lines = [",".join([*row[:4], str(abs(float(row[4]))), "0.5"]) for row in rows]
         path.write_text("\n".join([HEADER.replace(old, new), *lines]))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         sj.read_steady_states(path, model(motion))
 
 
-def test_a_force_where_the_model_has_a_base_is_said(tmp_path):
+def test_a_force_where_the_model_has_a_base_is_refused(tmp_path):
     path = tmp_path / "measured.csv"
     path.write_text("level,frequency_hz,force_n,velocity_re_m_s,velocity_im_m_s\n1,50,1,0.1,0\n")
-    with pytest.raises(ValueError, match=r"has `force_n`, but the model's \[base\] says"):
+    with pytest.raises(ValueError, match=r"has `force_n`, but the model has base excitation"):
         sj.read_steady_states(path, model("absolute"))

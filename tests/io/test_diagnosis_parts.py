@@ -1,4 +1,4 @@
-"""What a diagnosis writes of its parts: an entry of the file for each, and the table of remainders.
+"""Parts of a diagnosis in the files: an entry for each, and the table of remainders.
 
 The states are those of `truths.growing_damping` with harmonics 2 and 3 of cubic damping.
 """
@@ -17,31 +17,31 @@ PARTS = ["stiffness", "damping", "harmonic_2", "harmonic_3"]
 
 
 @pytest.fixture(scope="module")
-def found():
+def diagnosis():
     return sj.diagnose_model(linear_model(), measured("cubic_damping", STD, range(5)))
 
 
-def test_the_file_has_an_entry_for_every_part(found):
-    parts = json.loads(json.dumps(summarise_diagnosis(found)))["parts"]
+def test_the_file_has_an_entry_for_every_part(diagnosis):
+    parts = json.loads(json.dumps(summarise_diagnosis(diagnosis)))["parts"]
     assert [one["part"] for one in parts] == [*PARTS, "instrument"]
     keys = ["part", "verdict", "effects", "candidates", "probability", "explained", "remainder"]
     assert all(list(one) == keys for one in parts)
-    told = {one["part"]: one for one in parts}
+    by_part = {one["part"]: one for one in parts}
     for name in ("damping", "harmonic_3"):
-        assert told[name]["effects"] == ["cubic_damping"]
-        assert told[name]["candidates"] == [["cubic_damping"]]
-        assert told[name]["explained"]["low"] <= told[name]["explained"]["value"] <= 1.0
-        assert set(told[name]["explained"]) == {"value", "low", "high"}
+        assert by_part[name]["effects"] == ["cubic_damping"]
+        assert by_part[name]["candidates"] == [["cubic_damping"]]
+        assert by_part[name]["explained"]["low"] <= by_part[name]["explained"]["value"] <= 1.0
+        assert set(by_part[name]["explained"]) == {"value", "low", "high"}
     for name in ("stiffness", "harmonic_2", "instrument"):
-        assert (told[name]["verdict"], told[name]["effects"]) == ("none", [])
-        assert told[name]["explained"] is None
-    assert told["instrument"]["remainder"] is None
+        assert (by_part[name]["verdict"], by_part[name]["effects"]) == ("none", [])
+        assert by_part[name]["explained"] is None
+    assert by_part["instrument"]["remainder"] is None
     for name in PARTS:
-        assert set(told[name]["remainder"]) == {"rms", "significant"}
+        assert set(by_part[name]["remainder"]) == {"rms", "significant"}
 
 
-def test_the_table_of_remainders_has_a_curve_for_every_part(found):
-    columns = remainder_columns(found.parts)
+def test_the_table_of_remainders_has_a_curve_for_every_part(diagnosis):
+    columns = remainder_columns(diagnosis.parts)
     assert list(columns) == ["part", "velocity_m_s", "value", "std"]
     part, velocity, value, std = (np.array(column) for column in columns.values())
     assert list(dict.fromkeys(part.tolist())) == PARTS

@@ -1,4 +1,4 @@
-"""Models: round trips, what is accepted, what is refused and in which words."""
+"""Models: round trips, accepted files, and refusals with their messages."""
 
 import os
 import re
@@ -170,14 +170,14 @@ def swapped(old, new, content=MODEL):
     return content.replace(old, new, 1)
 
 
-# What the frequency of mode 1 is not, and what is expected.
+# Invalid frequencies of mode 1, and the expectation.
 NO_FREQUENCIES = {
     **dict.fromkeys(['"79.02"', '""', "true", "2024-01-01", "[79.02]"], "a number"),
     **dict.fromkeys(["nan", "inf", "1" + "0" * 400, "0x" + "F" * 5000], "a finite number"),
     **dict.fromkeys(["-3.2", "0"], "positive"),
     "1.5e308": "below 1e300 Hz",
 }
-# What other numbers are not: the line, what it becomes, the place, and what is expected.
+# Other numbers out of range: the line, its replacement, the location, and the expectation.
 OUT_OF_RANGE = [
     ("damping_ratio = 0.05", "damping_ratio = -0.05", "mode 1", "from 0 to below 1"),
     ("damping_ratio = 0.05", "damping_ratio = 1.0", "mode 1", "from 0 to below 1"),
@@ -193,7 +193,7 @@ OUT_OF_RANGE = [
     ("stiffness = 1000", 'stiffness = "stiff"', "effect 2", "a number"),
     ("stiffness = 1000", "stiffness = inf", "effect 2", "a finite number"),
 ]
-# A line that is missing, and the place that lacks its key.
+# A missing line, and the location that lacks its key.
 MISSING = {
     "frequency_hz = 79.02\n": "mode 1 of",
     "damping_ratio = 0\n": "mode 2 of",
@@ -203,7 +203,7 @@ MISSING = {
     "coefficient = 3.4e12, ": "monomial '1111'",
     "stiffness = 1000\n": "(gap_stiffness)",
 }
-# A key, how it is misspelt, and the place of it.
+# A key, its misspelling, and its location.
 MISSPELT = [
     ("damping_ratio =", "dampin_ratio =", "mode 1 of"),
     ("frequency_hz =", "frequency_rad_s =", "mode 1 of"),
@@ -223,11 +223,11 @@ def test_refuses_what_is_no_frequency(tmp_path, value, check_message):
     check_message(error, [NO_FREQUENCIES[value], "mode 1 of model.toml has"])
 
 
-@pytest.mark.parametrize(("line", "other", "place", "expected"), OUT_OF_RANGE)
-def test_refuses_numbers_out_of_range(tmp_path, line, other, place, expected, check_message):
+@pytest.mark.parametrize(("line", "other", "location", "expected"), OUT_OF_RANGE)
+def test_refuses_numbers_out_of_range(tmp_path, line, other, location, expected, check_message):
     with pytest.raises(ValueError, match=f"`{line.partition(' ')[0]}` must be") as error:
         read(tmp_path, swapped(line, other))
-    check_message(error, [expected, f"{place} of model.toml"])
+    check_message(error, [expected, f"{location} of model.toml"])
 
 
 @pytest.mark.parametrize("line", MISSING)
@@ -237,12 +237,14 @@ def test_refuses_a_missing_key(tmp_path, line, check_message):
     check_message(error, [MISSING[line], "model.toml"])
 
 
-@pytest.mark.parametrize(("key", "other", "place"), MISSPELT)
-def test_refuses_a_misspelt_key_and_says_which_is_meant(tmp_path, key, other, place, check_message):
+@pytest.mark.parametrize(("key", "other", "location"), MISSPELT)
+def test_refuses_a_misspelt_key_and_suggests_the_right_one(
+    tmp_path, key, other, location, check_message
+):
     word, meant = (name.strip(" =") for name in (other, key))
     with pytest.raises(ValueError, match=f"unknown key '{word}'") as error:
         read(tmp_path, swapped(key, other))
-    check_message(error, [place, f"did you mean `{meant}`"])
+    check_message(error, [location, f"did you mean `{meant}`"])
 
 
 BAD = {
@@ -447,7 +449,7 @@ def test_reads_or_refuses_a_damaged_model(tmp_path_factory, data):
 finite = st.floats(-1e200, 1e200)
 spread = st.one_of(st.just(0.0), st.floats(0.0, 1e200))
 above_minus_one = st.floats(-1.0, 1e200, exclude_min=True)
-# What the parameters with a rule may be.
+# Ranges of the parameters with a rule.
 PARAMETERS = {
     "relative_shift": above_minus_one,
     "relative_drift": above_minus_one,
@@ -526,7 +528,7 @@ def test_round_trip(tmp_path_factory, model):
     assert same(back, model, rtol=2 * np.finfo(float).eps)
     assert np.array_equal(back.modes.mode_shape, model.modes.mode_shape)
     assert np.array_equal(back.potential.coefficient, model.potential.coefficient)
-    # What came from a file returns to the last bit.
+    # Numbers from a file are restored exactly.
     content = path.read_bytes()
     write_model(path, back)
     assert path.read_bytes() == content

@@ -46,7 +46,7 @@ def same(one, other):
     return all(np.array_equal(a, b) for a, b in leaves)
 
 
-def test_a_file_holds_what_the_arrays_do(read):
+def test_a_file_gives_the_same_structure_as_the_arrays(read):
     model = read(TEXT)
     assert model.name == "two"
     assert model.modes.sensors == ("a", "b")
@@ -59,7 +59,7 @@ def test_a_file_holds_what_the_arrays_do(read):
 
 
 @pytest.mark.parametrize("suffix", ["npz", "mat"])
-def test_matrices_stand_in_files(read, tmp_path, suffix):
+def test_matrices_in_files(read, tmp_path, suffix):
     inline = read(TEXT)
     arrays = {
         "mass": np.diag([1.0, 0.05]),
@@ -164,9 +164,9 @@ def test_what_cannot_be_is_refused_in_one_sentence(read, check_message, old, new
 
 @pytest.mark.parametrize(
     ("file", "complaint"),
-    [("none.npz", "a file beside"), ("m.xls", r"an \.npz or \.mat"), ("bad.npz", "cannot be read")],
+    [("none.npz", "file next to"), ("m.xls", r"an \.npz or \.mat"), ("bad.npz", "cannot be read")],
 )
-def test_files_that_hold_no_matrices_are_refused(read, tmp_path, check_message, file, complaint):
+def test_files_without_matrices_are_refused(read, tmp_path, check_message, file, complaint):
     for name in ("m.xls", "bad.npz"):
         (tmp_path / name).write_text("nothing")
     with pytest.raises(ValueError, match=complaint) as error:
@@ -176,7 +176,7 @@ def test_files_that_hold_no_matrices_are_refused(read, tmp_path, check_message, 
 
 @pytest.mark.parametrize("damage", ["sides", "type", "rows", "checksum"])
 def test_damaged_matlab_files_are_refused(read, tmp_path, check_message, damage):
-    """Three of them ended the process within scipy, or as soon as a matrix was used."""
+    """Three of them crashed scipy, or the process when a matrix was used."""
     arrays = {"mass": np.diag([1.0, 0.05]), "stiffness": scipy.sparse.csc_array(np.diag([1.0, 2]))}
     path = tmp_path / "bad.mat"
     is_packed = damage == "checksum"
@@ -207,7 +207,7 @@ def test_a_response_has_columns_for_every_sensor(tmp_path, read):
     write_response(tmp_path / "response.csv", curves, sensor="b")
     table = np.genfromtxt(tmp_path / "response.csv", delimiter=",", names=True, dtype=None)
     wanted = curves[0].velocity[:, 1]
-    for place, name in enumerate("ab"):
-        found = table[f"velocity_h1_{name}_re_m_s"] + 1j * table[f"velocity_h1_{name}_im_m_s"]
-        np.testing.assert_allclose(found, wanted[:, place], rtol=1e-10)
+    for index, name in enumerate("ab"):
+        velocity = table[f"velocity_h1_{name}_re_m_s"] + 1j * table[f"velocity_h1_{name}_im_m_s"]
+        np.testing.assert_allclose(velocity, wanted[:, index], rtol=1e-10)
     np.testing.assert_array_equal(table["velocity_h1_re_m_s"], table["velocity_h1_b_re_m_s"])

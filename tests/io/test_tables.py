@@ -1,4 +1,4 @@
-"""Tables: round trips, what is accepted, what is refused and in which words."""
+"""Tables: round trips, accepted files, and refusals with their messages."""
 
 import dataclasses
 import os
@@ -34,11 +34,11 @@ def read(tmp_path, content, sensors=None):
 
 
 def same(one: SteadyStates, other: SteadyStates) -> bool:
-    """Equal to the last bit, but for what passes through Hz or degrees: there one rounding."""
+    """Equal to the last bit, except for one rounding of numbers in Hz or degrees."""
     for name in (field.name for field in dataclasses.fields(SteadyStates)):
         a, b = getattr(one, name), getattr(other, name)
         if name == "notes":
-            continue  # about the file, not of the states
+            continue  # a note on the file
         if name in ("sensors", "harmonic_order", "base"):
             equal = a == b
         elif name in ("frequency", "phase_std"):
@@ -204,7 +204,7 @@ def test_an_amplitude_alone_has_no_phase(tmp_path):
     assert np.all(states.phase_unknown)
     assert any("amplitude of the velocity alone" in str(note) for note in reading.notes)
     assert any("`phase_std_deg`" in str(note) for note in reading.notes)
-    # What is written is read as the same.
+    # The written file reads back the same.
     write_steady_states(tmp_path / "again.csv", states)
     assert np.all(read_steady_states(tmp_path / "again.csv").phase_unknown)
 
@@ -239,7 +239,7 @@ def test_sensors_come_in_the_order_of_the_model(tmp_path):
     assert not np.any(data.measured[:, 1])
 
 
-def test_test_order_tells_repeats_apart(tmp_path):
+def test_test_order_distinguishes_repeats(tmp_path):
     table = with_column("order", [0, 0.5, 0.1, 0.5, 0, ""], SENSORS)
     data = read(tmp_path, table)
     expected = [[0.01, 0.05], [0.04, 0.02], [0.0, 0.03], [0.06, 0.0]]
@@ -269,7 +269,7 @@ def swapped(old, new, table=TABLE):
     return table.replace(old, new, 1)
 
 
-# A column's name that is not of the format, and the column that it must have meant.
+# A misspelt column, and the one that is meant.
 MISNAMED = {
     "frequency_hz": ["frequency_rad_s", "frequency_khz", "frequency", "Frequency [Hz]", "freq_hz"],
     "level": ["Level", "lvl"],
@@ -514,7 +514,7 @@ NAMES = ("a", "b, c", 'quoted "x"')
 
 @st.composite
 def measured_states(draw):
-    """Steady states as a test may give them, some of them only partly stated."""
+    """Steady states as from a test, some with optional quantities missing."""
     n = draw(st.integers(1, 5))
     sensors = NAMES[: draw(st.integers(1, 3))]
     shape = (n, len(sensors))
@@ -569,7 +569,7 @@ def test_round_trip(tmp_path_factory, data):
     write_steady_states(path, data)
     back = read_steady_states(path, sensors=data.sensors)
     assert same(back, data)
-    # What came from a file returns to the last bit.
+    # Numbers from a file are restored exactly.
     content = path.read_bytes()
     write_steady_states(path, back)
     assert path.read_bytes() == content
@@ -635,7 +635,7 @@ def one_state(**changes):
                 sensors=("a", "b"),
                 measured=np.eye(2, dtype=bool),
             ),
-            "tell some steady states apart",
+            "distinguish some steady states",
         ),
     ],
 )

@@ -26,15 +26,15 @@ def test_a_linear_oscillator_is_found_by_its_base(relative, along):
     )
     np.testing.assert_allclose(states.force, np.abs(BASE), rtol=1e-12)
     modes = sj.model.linear_modes([OWN], [RATIO], [[MASS**-0.5]], [-along * MASS**0.5])
-    found = sj.identify.identify_points(states, modes)
-    np.testing.assert_allclose(found.natural_frequency, OWN, rtol=1e-12)
-    np.testing.assert_allclose(found.damping_ratio, RATIO, rtol=1e-10)
+    result = sj.identify.identify_points(states, modes)
+    np.testing.assert_allclose(result.natural_frequency, OWN, rtol=1e-12)
+    np.testing.assert_allclose(result.damping_ratio, RATIO, rtol=1e-10)
 
 
 def test_shapes_that_disagree_are_said():
     with pytest.raises(ValueError, match=r"`velocity` \(3, 1\), but have"):
         sj.measure.base_excited_states([1, 2, 3], OMEGA, BASE, np.ones((2, 1)))
-    with pytest.raises(ValueError, match="one number a sensor"):
+    with pytest.raises(ValueError, match="one number per sensor"):
         sj.measure.base_excited_states([1, 2, 3], OMEGA, BASE, np.ones((3, 1)), along=[1.0, 1.0])
 
 

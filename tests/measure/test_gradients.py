@@ -16,7 +16,7 @@ AMPLITUDES = RNG.normal(size=(3, 4)) + 1j * RNG.normal(size=(3, 4))
 
 
 def moved(relative):
-    """Twelve complex amplitudes, changed in size by twelve numbers."""
+    """Twelve complex amplitudes, changed in magnitude by twelve numbers."""
     return AMPLITUDES * (1 + relative.reshape(3, 4))
 
 

@@ -16,7 +16,7 @@ from snrmjax.measure.phase_convention import MisreadPhases, wrong_phases
 
 MEASURED = Path(__file__).resolve().parents[3] / "shared" / "data"
 HERTZ = 2 * np.pi
-# What was recorded of a velocity V at Ω, and what is said of it: conjugated, quarter turns, motion.
+# Recorded forms of a velocity V at Ω, and the expected diagnosis: conjugated, rotation, motion.
 RECORDED = {
     "conjugated": (lambda v, _: v.conj(), (True, 0, "")),
     "displacement": (lambda v, w: v / (1j * w), (False, 1, "displacement")),
@@ -68,16 +68,16 @@ def test_a_drive_voltage_is_as_good_as_a_force(how):
 def test_of_an_unknown_force_the_unit_cannot_be_said():
     level, omega, force, velocity = exact()
     volts = stated(level, omega, np.full(len(level), np.nan), velocity, drive=force / 0.3)
-    (said,) = wrong_phases(recorded(volts, "displacement"), modes())
-    assert (said["quarter_turns"], said["instead"]) == (1, "")
+    (fact,) = wrong_phases(recorded(volts, "displacement"), modes())
+    assert (fact["quarter_turns"], fact["instead"]) == (1, "")
 
 
 def test_a_mode_that_moves_against_the_force_is_no_wrong_sign():
     against = sj.model.linear_modes([OMEGA], [0.012], [[-SHAPE]], [3.0])
     opposite = recorded(noisy(1), "opposite")
     assert wrong_phases(opposite, against) == ()
-    (said,) = wrong_phases(noisy(1), against)
-    assert (said["quarter_turns"], said["same_sign"]) == (2, False)
+    (fact,) = wrong_phases(noisy(1), against)
+    assert (fact["quarter_turns"], fact["same_sign"]) == (2, False)
 
 
 @pytest.mark.parametrize("how", RECORDED)
@@ -106,10 +106,10 @@ def test_states_near_resonance_alone_leave_two_readings_and_both_are_said():
     data = noisy(1, widest=2)  # degrees
     assert wrong_phases(data, modes()) == ()
     assert wrong_phases(recorded(data, "conjugated"), modes()) == ()  # it may be so
-    (said,) = wrong_phases(recorded(data, "opposite"), modes())
-    assert said.kind == "phases_misread_alike"
-    assert said["readings"] == ((False, 2), (True, 2))
-    assert "turned by 180° or conjugated and then turned by 180°" in str(said)
+    (fact,) = wrong_phases(recorded(data, "opposite"), modes())
+    assert fact.kind == "phases_misread_alike"
+    assert fact["readings"] == ((False, 2), (True, 2))
+    assert "shifted by 180° or conjugated and then shifted by 180°" in str(fact)
 
 
 def test_silent_where_the_phases_tell_nothing():
@@ -157,8 +157,8 @@ def test_measured_beams(table):
 
 
 def test_the_pointwise_verb_says_it():
-    found = sj.identify_backbone(recorded(noisy(1), "conjugated"), modes())
-    check_said(found.notes, "conjugated")
+    result = sj.identify_backbone(recorded(noisy(1), "conjugated"), modes())
+    check_said(result.notes, "conjugated")
     with pytest.raises(MisreadPhases, match=r"As the data are: a backbone needs") as error:
         sj.identify_backbone(recorded(noisy(1), "displacement"), modes())
     check_named(error.value.facts, "displacement")
@@ -179,24 +179,24 @@ def test_the_joint_fit_says_it():
 @pytest.mark.parametrize("how", ["conjugated", "opposite"])
 def test_the_diagnosis_says_it(how):
     """Of opposite signs rounding says in which minimum of nothing it ends: none is an answer."""
-    found = sj.diagnose_model(linear_model(), recorded(balanced(quadratic), how))
-    assert found.verdict in ("unknown", "noise_rejected")
-    assert found.gap.after > 2  # times the noise, of which right phases leave one
+    result = sj.diagnose_model(linear_model(), recorded(balanced(quadratic), how))
+    assert result.verdict in ("unknown", "noise_rejected")
+    assert result.gap.after > 2  # times the noise, of which right phases leave one
     (fact,) = wrong_phases(recorded(balanced(quadratic), how), linear_model())
     check_named([fact], how)
-    assert str(found.notes[0]) == str(fact)
+    assert str(result.notes[0]) == str(fact)
 
 
-@pytest.mark.parametrize(("factor", "said"), [(1000.0, True), (0.001, True), (1.1, False)])
-def test_a_force_in_another_unit_is_named(factor, said):
+@pytest.mark.parametrize(("factor", "detected"), [(1000.0, True), (0.001, True), (1.1, False)])
+def test_a_force_in_another_unit_is_named(factor, detected):
     """Volts called newtons, or kilonewtons: no modal mass that a linear test finds does that."""
     data = noisy(1)
     data = dataclasses.replace(data, force=data.force * factor)
-    found = wrong_phases(data, modes())
-    assert bool(found) is said
-    if said:
-        assert found[0].kind == "velocity_over_force_off"
-        np.testing.assert_allclose(found[0]["ratio"], 1 / factor, rtol=0.1)  # noise
+    result = wrong_phases(data, modes())
+    assert bool(result) is detected
+    if detected:
+        assert result[0].kind == "velocity_over_force_off"
+        np.testing.assert_allclose(result[0]["ratio"], 1 / factor, rtol=0.1)  # noise
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -41,10 +41,10 @@ def brute_peak(amplitudes, orders):
 
     grid = np.linspace(0, 2 * np.pi, 4001)
     best = grid[np.argmin([negative(angle) for angle in grid])]
-    found = scipy.optimize.minimize_scalar(
+    result = scipy.optimize.minimize_scalar(
         negative, bounds=(best - 2e-3, best + 2e-3), method="bounded", options={"xatol": 1e-10}
     )
-    return -found.fun
+    return -result.fun
 
 
 class TestPeak:
@@ -69,8 +69,8 @@ class TestPeak:
             ([0, 1.0, 0, -1 / 9], 8 / 9, 1e-12),
             ([0, 0, 0, 0], 0.0, 0.0),
         ):
-            found = peak_amplitude(np.array(amplitudes, dtype=complex), (0, 1, 2, 3))
-            np.testing.assert_allclose(found, peak, rtol=tolerance)
+            result = peak_amplitude(np.array(amplitudes, dtype=complex), (0, 1, 2, 3))
+            np.testing.assert_allclose(result, peak, rtol=tolerance)
 
     def test_time_shift_and_units(self):
         turned = TRUTH * np.exp(0.77j * np.arange(4))

@@ -72,14 +72,14 @@ def test_records_written_and_read_back(tmp_path):
     velocity = velocity + np.repeat(list(third.values()), dwell) * turn**3
     channels = [sj.measure.Channel("CH1", "force"), sj.measure.Channel("CH2", "velocity")]
     record = sj.measure.time_recording(np.stack([level * turn, velocity]).real, channels, rate)
-    found = sj.measure.stepped_sine_states(
+    result = sj.measure.stepped_sine_states(
         *(record, "CH1", ["CH2"]),
         harmonic_order=(1, 3),
         sensors=["tip"],
         frequencies=[(0.25 * k, 0.25 * (k + 1), OMEGA) for k in range(6)],
         settle=0.0,
     )
-    sj.io.write_steady_states(tmp_path / "measured.csv", found.states)
+    sj.io.write_steady_states(tmp_path / "measured.csv", result.states)
     again = sj.io.read_steady_states(tmp_path / "measured.csv")
     assert again.sensors == ("tip",)
     assert again.harmonic_order == (3,)

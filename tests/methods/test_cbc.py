@@ -16,12 +16,12 @@ def laboratory():
 
 def stiffness(velocity, omega):
     """F/v of one term of harmonic balance, N s/m."""
-    size = velocity / omega
-    square = REST**2 + 0.75 * CUBIC * size**2 - omega**2
+    amplitude = velocity / omega
+    square = REST**2 + 0.75 * CUBIC * amplitude**2 - omega**2
     return MASS * (2 * RATIO * REST + square / (1j * omega))
 
 
-def test_it_holds_the_branch_that_an_open_loop_jumps_over(laboratory):
+def test_it_stabilises_the_branch_that_an_open_loop_jumps_over(laboratory):
     omega = 1.03 * REST
     settings = sj.simulate.FeedbackSettings(20.0)
     curve = sj.simulate.s_curve(laboratory, omega, np.linspace(0.1, 1.2, 12), settings)
@@ -44,14 +44,14 @@ def test_the_backbone_does_not_depend_on_the_gain(laboratory):
     for result in found:
         assert result.found.all()
         half = REST**2 / 2
-        size = result.velocity
-        true = np.sqrt(half + np.sqrt(half**2 + 0.75 * CUBIC * size**2))
+        amplitude = result.velocity
+        true = np.sqrt(half + np.sqrt(half**2 + 0.75 * CUBIC * amplitude**2))
         np.testing.assert_allclose(result.natural_frequency, true, rtol=3e-4)
         modal = 2 * result.damping_ratio * result.natural_frequency
         np.testing.assert_allclose(modal, 2 * RATIO * REST, rtol=5e-3)
 
 
-def test_what_is_not_held_is_said(laboratory):
+def test_an_uncontrolled_motion_is_reported(laboratory):
     impatient = sj.simulate.FeedbackSettings(20.0, invasive=1e-9)
     result = sj.methods.control_based_continuation(laboratory, np.array([0.3]), impatient)
     assert list(result.status) == [int(MethodStatus.NOT_LOCKED)]
@@ -61,7 +61,7 @@ def test_what_is_not_held_is_said(laboratory):
         sj.simulate.s_curve(laboratory, REST, np.array([0.3]), sj.simulate.FeedbackSettings(0.0))
 
 
-def test_a_followed_fundamental_holds_the_same_branch_and_too_fast_a_filter_is_seen(laboratory):
+def test_a_tracked_fundamental_gives_the_same_branch_and_too_fast_a_filter_is_detected(laboratory):
     omega = 1.03 * REST
     settings = sj.simulate.FeedbackSettings(20.0, filter_rate=80.0)
     curve = sj.simulate.s_curve(laboratory, omega, np.linspace(0.1, 1.2, 6), settings)
@@ -93,12 +93,12 @@ def linear():
 FILTERED = sj.simulate.FeedbackSettings(20.0, filter_rate=60.0)
 
 
-def test_a_phase_that_is_left_does_not_move_the_frequency(linear):
+def test_a_residual_phase_error_does_not_bias_the_frequency(linear):
     shape, cubic = 1 / np.sqrt(MASS), 2e6
     potential = sj.model.polynomial_potential({"1111": cubic * shape**2 / 4}, 1)
     lab = linear(0.0, 0.0, potential)
     result = sj.methods.control_based_continuation(lab, np.array([0.8]), FILTERED)
-    # Less than half a degree from the linear mode: the first motion held is the last.
+    # Less than half a degree from the linear mode: the first controlled motion is the last.
     shift = 0.375 * cubic * (result.velocity / REST**2) ** 2
     assert (shift > 3e-5).all()
     np.testing.assert_allclose(result.natural_frequency / REST - 1, shift, rtol=0, atol=2e-6)

@@ -1,4 +1,4 @@
-"""The command `compare` on time records: sorted by what they are, and refused with a reason."""
+"""The command `compare` on time records: classified by kind, and refused with a reason."""
 
 import csv
 import json
@@ -39,7 +39,7 @@ DECAY = table(time_s=TIME, velocity_m_s=VELOCITY)
 
 @pytest.fixture
 def compare(tmp_path, monkeypatch, capsys):
-    """Run the command on texts of files: its exit code, its words and its folder."""
+    """Run the command on texts of files: its exit code, its messages and its folder."""
 
     def run(files, *options):
         (tmp_path / "model.toml").write_text(MODEL + "participation = 1.0\n")
@@ -58,10 +58,10 @@ def compare(tmp_path, monkeypatch, capsys):
 
 def test_a_decay_goes_to_the_methods_of_decays(compare):
     names = ("snrm", "resonant_decay", "restoring_force")
-    code, said, out = compare({"ring.csv": DECAY}, *(f"--method={name}" for name in names))
+    code, printed, out = compare({"ring.csv": DECAY}, *(f"--method={name}" for name in names))
     assert code == 0
-    assert "ring.csv: free decay (no force or drive acts, and the motion falls)" in said
-    assert "did not run: snrm: steady states are needed, and the data have none." in said
+    assert "ring.csv: free decay (no force or drive acts, and the motion decays)" in printed
+    assert "did not run: snrm: steady states are needed, and the data have none." in printed
     with (out / "compare.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["status"] == "found"]
     assert {row["method"] for row in rows} == set(names[1:])
@@ -89,19 +89,19 @@ def test_what_some_data_do_not_allow_does_not_stop_the_others():
 
 
 def _tone():
-    turn = HERTZ * 40 * TIME
-    return {"time_s": TIME, "force_n": np.cos(turn), "velocity_m_s": 0.1 * np.cos(turn)}
+    phase = HERTZ * 40 * TIME
+    return {"time_s": TIME, "force_n": np.cos(phase), "velocity_m_s": 0.1 * np.cos(phase)}
 
 
 def _steps(below=True):
     """Ten steps of 16 cycles: of a spring (below resonance) or above it."""
     hertz = (36.0 if below else 44.0) + 0.3 * (TIME / 0.4).astype(int)
-    turn = HERTZ * np.cumsum(hertz) / RATE
+    phase = HERTZ * np.cumsum(hertz) / RATE
     lead = 1.5 if below else -1.5
     return {
         "time_s": TIME,
-        "force_n": np.cos(turn),
-        "velocity_m_s": 0.01 * (1 + 0.1 * (hertz - hertz[0])) * np.cos(turn + lead),
+        "force_n": np.cos(phase),
+        "velocity_m_s": 0.01 * (1 + 0.1 * (hertz - hertz[0])) * np.cos(phase + lead),
     }
 
 
@@ -160,9 +160,9 @@ BAD = {
 def test_bad_records_are_refused_in_one_sentence(compare, name):
     text, methods, sentence = BAD[name]
     options = [f"--method={one}" for one in methods]
-    code, said, out = compare({"bad.csv": text}, *options)
-    assert code == 2, said
-    assert sentence in said
+    code, printed, out = compare({"bad.csv": text}, *options)
+    assert code == 2, printed
+    assert sentence in printed
     assert not out.exists()
 
 
@@ -188,7 +188,7 @@ def _recording(**columns):
     return time_recording(np.stack(list(columns.values())), channels, RATE, name="test")
 
 
-def test_records_are_sorted_by_what_they_are():
+def test_records_are_classified_by_kind():
     steps = _steps()
     sweep = np.cos(HERTZ * (36 * TIME + TIME**2))
     pulse = np.where(TIME < 0.005, 100.0, 0.0)

@@ -1,4 +1,4 @@
-"""Decays of an arch (even terms, a middle that moves, heavy damping) by all methods of decays."""
+"""Decays of an arch (even terms, a drifting mean, heavy damping) by all decay methods."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ REST, RATIO, SIZE, RATE = 2 * np.pi * 65.0, 0.05, 4e-4, 4000.0  # rad/s, 1, m, H
 EVEN, CUBIC = 0.6 / SIZE, 0.25 / SIZE**2
 
 
-def pull(q):
+def restoring_force(q):
     return REST**2 * (q + EVEN * q**2 + CUBIC * q**3)
 
 
@@ -18,7 +18,7 @@ def pull(q):
 def decay():
     time = np.arange(0, 0.4, 1 / RATE)
     found = solve_ivp(
-        lambda _, state: (state[1], -pull(state[0]) - 2 * RATIO * REST * state[1]),
+        lambda _, state: (state[1], -restoring_force(state[0]) - 2 * RATIO * REST * state[1]),
         *((0, time[-1]), (SIZE, 0.0)),
         t_eval=time,
         rtol=1e-10,
@@ -32,16 +32,16 @@ def decay():
 def mode():
     """Fundamental velocity, natural frequency and damping ratio of undamped motions."""
 
-    def turns(_, state):
+    def turning_point(_, state):
         return state[1]
 
-    turns.terminal, turns.direction = True, 1.0
+    turning_point.terminal, turning_point.direction = True, 1.0
     rows = []
-    for size in np.linspace(0.03, 0.9, 12) * SIZE:
+    for amplitude in np.linspace(0.03, 0.9, 12) * SIZE:
         found = solve_ivp(
-            lambda _, state: (state[1], -pull(state[0])),
-            *((0, 0.02), (size, -1e-12)),
-            events=turns,
+            lambda _, state: (state[1], -restoring_force(state[0])),
+            *((0, 0.02), (amplitude, -1e-12)),
+            events=turning_point,
             dense_output=True,
             rtol=1e-10,
             atol=1e-14,
@@ -50,14 +50,14 @@ def mode():
         angle = np.pi * (np.arange(200) + 0.5) / 200
         speed = -found.sol(angle / omega)[1]
         fundamental = 2 * np.mean(speed * np.sin(angle))
-        lost = 4 * RATIO * REST * np.mean(speed**2) / fundamental**2
-        rows.append((fundamental, omega, lost / (2 * omega)))
+        dissipation = 4 * RATIO * REST * np.mean(speed**2) / fundamental**2
+        rows.append((fundamental, omega, dissipation / (2 * omega)))
     return np.array(rows).T
 
 
-# Worst relative errors of frequency and damping: of a motion that loses a quarter a cycle local
-# lines see few extremes; a surface is exact but for noise (1e-4) and first and last cycles; the
-# polynomials of a manifold are cut off at degree 7, which the largest amplitudes feel.
+# Worst relative errors of frequency and damping: a motion that decays by a quarter per cycle has
+# few extremes per local line; a surface is exact but for noise (1e-4) and the first and last
+# cycles; the manifold's polynomials are truncated at degree 7, which affects large amplitudes.
 @pytest.mark.parametrize(
     ("method", "frequency", "damping"),
     [

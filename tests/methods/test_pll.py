@@ -39,7 +39,7 @@ def test_it_climbs_the_backbone_on_a_shaker_whose_force_drops(beam):
 
 
 @pytest.mark.long
-def test_gains_do_not_move_the_answer_and_bad_ones_say_so(beam):
+def test_the_result_does_not_depend_on_the_gains_and_bad_ones_are_reported(beam):
     lab = laboratory(beam)
     one = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3])
     gains = sj.simulate.LoopGains(2 * np.pi * 3.0, 2 * np.pi * 0.25)
@@ -61,7 +61,7 @@ def test_noise_stays_within_its_error(beam):
     np.testing.assert_allclose(result.natural_frequency, backbone(result.velocity), rtol=5e-4)
 
 
-def test_settings_that_make_no_sense_are_refused(beam):
+def test_inadmissible_settings_are_refused(beam):
     with pytest.raises(ValueError, match="`voltages` must be positive"):
         sj.methods.phase_locked_loop(laboratory(beam), np.array([1.0, -1.0]))
     with pytest.raises(ValueError, match="`sampling_rate` times `substeps` must be 20 times"):

@@ -1,4 +1,4 @@
-"""Nonlinear state-space models of oscillators whose mode is known without them."""
+"""Nonlinear state-space models of oscillators with a known nonlinear mode."""
 
 from types import SimpleNamespace
 
@@ -28,30 +28,30 @@ def discrete_oscillator():
         (matrix, np.array([[0.0], [1 / MASS]]), np.array([[0.0, 1.0]]), np.zeros((1, 1))),
         *(1 / RATE, "foh"),
     )
-    turn = np.exp(1j * np.linspace(0.05, 1.2, 60))
+    points = np.exp(1j * np.linspace(0.05, 1.2, 60))
     a, b, c, d = found[:4]
-    values = np.array([(c @ np.linalg.solve(z * np.eye(2) - a, b) + d)[0, 0] for z in turn])
-    return np.linalg.eigvals(a), turn, values
+    values = np.array([(c @ np.linalg.solve(z * np.eye(2) - a, b) + d)[0, 0] for z in points])
+    return np.linalg.eigvals(a), points, values
 
 
 def test_the_linear_part_is_that_of_an_oscillator_for_a_force_straight_between_samples():
-    multipliers, turn, values = discrete_oscillator()
-    weight = np.ones(len(turn))
-    found = subspace_poles(turn, values, weight, 2)
+    multipliers, points, values = discrete_oscillator()
+    weight = np.ones(len(points))
+    found = subspace_poles(points, values, weight, 2)
     # Exact arithmetic would give them exactly: rounding of a least-squares problem.
     np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(multipliers), rtol=1e-9)
     upper = multipliers[multipliers.imag > 0]
     poles = np.stack([upper.real, upper.imag], axis=1)
-    drive, through = linear_terms(turn, values, weight, poles)
+    drive, through = linear_terms(points, values, weight, poles)
     model = StateSpace(poles, drive, np.array(through), np.zeros((2, 0)))
-    np.testing.assert_allclose(model_response(model, turn), values, rtol=1e-9)
+    np.testing.assert_allclose(model_response(model, points), values, rtol=1e-9)
     assert float(modal_constant(model, 0)) * RATE == pytest.approx(1 / MASS, rel=1e-9)
     # A band-limited force over the hold: what is left are images beyond the sampling rate.
-    omega = np.angle(turn) * RATE
+    omega = np.angle(points) * RATE
     mobility = 1j * omega / MASS / (REST**2 - omega**2 + 2j * RATIO * REST * omega)
     near = np.abs(omega / REST - 1) < 0.5
     images = (omega[near] / (2 * np.pi * RATE)) ** 2 / (2 * np.pi * RATE * MASS)
-    off = np.abs(values / hold(np.angle(turn)) - mobility)[near]
+    off = np.abs(values / hold(np.angle(points)) - mobility)[near]
     assert np.all(off < 3 * images + 1e-12)
 
 
@@ -65,11 +65,11 @@ def multisine(rms, seed, *, periods=5, noise=1e-3, motion="velocity"):
     rng = np.random.default_rng(seed)
     line = np.arange(int(18 * SAMPLES / RATE), int(90 * SAMPLES / RATE))
     phase = rng.uniform(0, 2 * np.pi, len(line))
-    size = rms * np.sqrt(2 / len(line))
+    amplitude = rms * np.sqrt(2 / len(line))
     time = np.arange(periods * SAMPLES) / RATE
 
     def force(t):
-        return size * np.sum(np.cos(2 * np.pi * line * RATE / SAMPLES * t + phase))
+        return amplitude * np.sum(np.cos(2 * np.pi * line * RATE / SAMPLES * t + phase))
 
     def rate(t, state):
         q, v = state
@@ -78,13 +78,17 @@ def multisine(rms, seed, *, periods=5, noise=1e-3, motion="velocity"):
     found = solve_ivp(
         rate, (0, time[-1]), (0, 0), t_eval=time, rtol=1e-7, atol=1e-10, method="DOP853"
     )
-    push = np.array([force(t) for t in time])
+    force_samples = np.array([force(t) for t in time])
     q, v = found.y
-    acceleration = push / MASS - REST**2 * q - CUBIC * q**3 - 2 * RATIO * REST * v
-    seen = {"velocity": v, "acceleration": acceleration}[motion]
-    seen = seen + noise * seen.std() * rng.standard_normal(len(seen))
+    acceleration = force_samples / MASS - REST**2 * q - CUBIC * q**3 - 2 * RATIO * REST * v
+    motion_samples = {"velocity": v, "acceleration": acceleration}[motion]
+    motion_samples = motion_samples + noise * motion_samples.std() * rng.standard_normal(
+        len(motion_samples)
+    )
     channels = [Channel("force", "force"), Channel("tip", motion)]
-    return time_recording(np.stack([push, seen]), channels, RATE, name="multisine")
+    return time_recording(
+        np.stack([force_samples, motion_samples]), channels, RATE, name="multisine"
+    )
 
 
 def backbone(velocity):
@@ -99,7 +103,7 @@ def test_mode_of_a_duffing_oscillator_from_three_realisations(motion):
     records = [multisine(0.5, seed, motion=motion) for seed in (0, 1, 2)]
     result = sj.methods.pnlss(records, "force", "tip")
     assert result.found.all()
-    # Four of the fit's own 1σ, and of frequency what one term of harmonic balance leaves out.
+    # Four of the fit's 1σ, and for frequency the truncation error of one-term harmonic balance.
     off = np.asarray(result.natural_frequency) - backbone(np.asarray(result.velocity))
     assert np.all(np.abs(off) < 4 * np.asarray(result.natural_frequency_std) + 3e-5 * REST)
     modal = 2 * np.asarray(result.damping_ratio) * np.asarray(result.natural_frequency)
@@ -110,20 +114,22 @@ def test_mode_of_a_duffing_oscillator_from_three_realisations(motion):
 
 
 @pytest.mark.long
-def test_a_model_that_does_not_fit_is_no_answer():
-    with pytest.raises(ValueError, match=r"the best model of degree 3 .* of the velocity"):
+def test_a_model_that_does_not_fit_is_refused():
+    with pytest.raises(
+        ValueError, match=r"the residual of the best model of degree 3 .* of the velocity"
+    ):
         sj.methods.pnlss(multisine(8.0, 0, periods=3), "force", "tip")
 
 
 def test_what_cannot_be_fitted_is_refused():
     rng = np.random.default_rng(0)
     once = np.fft.irfft(np.fft.rfft(rng.standard_normal(256)) * (np.arange(129) < 40), 256)
-    push = np.tile(once, 4)
-    moved = np.roll(push, 3)
+    force_samples = np.tile(once, 4)
+    moved = np.roll(force_samples, 3)
 
     def record(values, rate=RATE):
         channels = [Channel("force", "force"), Channel("tip", "velocity")]
-        return time_recording(np.stack([push, values]), channels, rate)
+        return time_recording(np.stack([force_samples, values]), channels, rate)
 
     fit = sj.methods.fit_state_space
     with pytest.raises(ValueError, match="`order` must be 2, 4 or 6"):
@@ -135,10 +141,10 @@ def test_what_cannot_be_fitted_is_refused():
     far = sj.model.linear_modes([400 * 2 * np.pi], [0.01], [[1.0]], [1.0])
     with pytest.raises(ValueError, match="lines around the mode at 400 Hz are needed"):
         fit(record(moved), "force", "tip", far)
-    with pytest.raises(ValueError, match="two periods are needed after the 3 left out"):
+    with pytest.raises(ValueError, match="two periods are needed after the 3 discarded"):
         fit(record(moved), "force", "tip", skip=3)
     with pytest.raises(ValueError, match="does not have 1 oscillating modes"):
-        fit(record(push), "force", "tip")
+        fit(record(force_samples), "force", "tip")
 
 
 @pytest.mark.long
@@ -169,9 +175,9 @@ def test_a_model_has_two_states_for_each_mode_that_is_excited():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("drag", "said"), [(0.0, False), (30.0, True)])
-def test_forces_that_are_no_polynomials_are_said(drag, said):
-    """No power of v draws v|v|: what it leaves is no noise."""
+@pytest.mark.parametrize(("drag", "reported"), [(0.0, False), (30.0, True)])
+def test_forces_that_are_not_polynomial_are_reported(drag, reported):
+    """v|v| is not polynomial: the residual exceeds the noise."""
     effects = [sj.model.make_effect("quadratic_damping", {"coefficient": drag})] if drag else []
     modes = sj.model.linear_modes([REST], [RATIO], [[1.0]], [1.0])
     laboratory = sj.simulate.Laboratory(
@@ -184,4 +190,4 @@ def test_forces_that_are_no_polynomials_are_said(drag, said):
     values = np.stack([np.asarray(played.force), np.asarray(played.velocity)])
     record = time_recording(values, channels, 2000.0, name="multisine")
     notes = sj.methods.pnlss(record, "force", "tip", modes).notes
-    assert any(note.kind == "misfit_beyond_noise" for note in notes) is said
+    assert any(note.kind == "misfit_beyond_noise" for note in notes) is reported

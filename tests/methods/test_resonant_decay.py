@@ -1,4 +1,4 @@
-"""Resonant decay against decays whose frequency and damping are known without it."""
+"""Resonant decay against decays of known frequency and damping."""
 
 import numpy as np
 import pytest
@@ -18,15 +18,15 @@ def decay():
     return duffing.decay(4000)
 
 
-def free_motion(size):
+def free_motion(amplitude):
     """Exact frequency, peak and fundamental velocity of the undamped oscillator, X cn(u | m)."""
-    stiff = REST**2 + CUBIC * size**2
-    m = CUBIC * size**2 / (2 * stiff)
+    stiff = REST**2 + CUBIC * amplitude**2
+    m = CUBIC * amplitude**2 / (2 * stiff)
     omega = np.pi * np.sqrt(stiff) / (2 * ellipk(m))
     nome = np.exp(-np.pi * ellipk(1 - m) / ellipk(m))
     fundamental = 2 * np.pi / (np.sqrt(m) * ellipk(m)) * np.sqrt(nome) / (1 + nome)
-    peak = np.sqrt(REST**2 * size**2 + CUBIC * size**4 / 2)
-    return omega, peak, omega * size * fundamental
+    peak = np.sqrt(REST**2 * amplitude**2 + CUBIC * amplitude**4 / 2)
+    return omega, peak, omega * amplitude * fundamental
 
 
 @pytest.mark.parametrize("reading", READINGS)
@@ -72,7 +72,7 @@ def test_the_bias_of_a_filter_is_estimated_and_within_the_error(softening, width
     squared = softening * result.velocity**2
     error = np.abs(modal / (DAMPING * (1 - squared / (1 + squared))) - 1)
     assert 0.4 < stated["damping"] / error.max() < 2.5
-    # Beyond the filter's, lines over windows err by their curvature: a few 1e-4.
+    # In addition to the filter's, the curvature within a window adds a few 1e-4.
     assert np.all(error < 3 * result.damping_ratio_std / result.damping_ratio + 1e-3)
 
 
@@ -84,7 +84,7 @@ def test_bad_records_are_refused(decay):
         (time[::20], velocity[::20], "samples a cycle"),
         (time**1.1, velocity, "evenly spaced"),
         (time, np.where(time > 1, np.nan, velocity), "NaN or inf"),
-        (time, velocity[1:], "of one length"),
+        (time, velocity[1:], "the same length"),
     ):
         with pytest.raises(ValueError, match=words):
             sj.methods.resonant_decay(times, record)
@@ -94,7 +94,7 @@ def test_bad_records_are_refused(decay):
         sj.methods.resonant_decay(time, velocity, reading="wavelet")
 
 
-def test_growth_is_no_mode(decay):
+def test_growth_is_not_a_mode(decay):
     time, velocity = decay
     result = sj.methods.resonant_decay(time, velocity[::-1].copy())
     assert set(result.status) == {int(sj.methods.MethodStatus.NOT_A_MODE)}

@@ -1,4 +1,4 @@
-"""Restoring-force surfaces of motions integrated in time with forces that are written down."""
+"""Restoring-force surfaces of simulated motions with known forces."""
 
 import numpy as np
 import pytest
@@ -18,8 +18,8 @@ def integrated(start, force=None, seconds=2.0):
 
     def rate(t, state):
         q, v = state
-        pull = REST**2 * q + CUBIC * q**3 + VISCOUS * v + QUADRATIC * v * abs(v)
-        return v, load(t) / MASS - pull
+        restoring_force = REST**2 * q + CUBIC * q**3 + VISCOUS * v + QUADRATIC * v * abs(v)
+        return v, load(t) / MASS - restoring_force
 
     found = solve_ivp(rate, (0, seconds), start, t_eval=time, rtol=1e-9, atol=1e-13)
     return time, found.y[1], load(time)
@@ -27,13 +27,13 @@ def integrated(start, force=None, seconds=2.0):
 
 def exact_backbone():
     """Fundamental velocity and natural frequency of the undamped Duffing oscillator: x = A cn."""
-    size = np.linspace(1e-6, 3e-3, 400)
-    at_top = REST**2 + CUBIC * size**2
-    modulus = CUBIC * size**2 / (2 * at_top)
+    amplitude = np.linspace(1e-6, 3e-3, 400)
+    at_top = REST**2 + CUBIC * amplitude**2
+    modulus = CUBIC * amplitude**2 / (2 * at_top)
     quarter = ellipk(modulus)
     natural = np.pi * np.sqrt(at_top) / (2 * quarter)
     nome = np.exp(-np.pi * ellipk(1 - modulus) / quarter)
-    fundamental = size * 2 * np.pi / (np.sqrt(modulus) * quarter) * np.sqrt(nome) / (1 + nome)
+    fundamental = amplitude * 2 * np.pi / (np.sqrt(modulus) * quarter) * np.sqrt(nome) / (1 + nome)
     return natural * fundamental, natural
 
 

@@ -1,4 +1,4 @@
-"""Spectral submanifolds of decays whose backbone and damping are known without them."""
+"""Spectral submanifolds of decays of known backbone and damping."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.special import ellipj, ellipk
 from truths import duffing
 
 import snrmjax as sj
-from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
+from snrmjax.methods.records.normal_form import NormalForm, form_of, sensor_signal, unknowns_of
 
 REST, DAMPING, CUBIC = duffing.REST, duffing.DECAY_RATE, duffing.DECAY_CUBIC
 
@@ -73,12 +73,14 @@ def test_the_record_of_a_form_and_its_derivatives():
     wave = 0.4 * z + sum(
         (c + d * abs(z) ** 2) * z**order for order, (c, d) in zip((2, 3), harmonics, strict=True)
     )
-    found = seen(form, time)
+    found = sensor_signal(form, time)
     np.testing.assert_allclose(found.signal, wave.real + 1e-3 + 2e-3 * np.abs(z) ** 2, atol=2e-6)
     point = unknowns_of(form)
     for k in range(len(point)):
         step = 1e-5 * max(1, abs(point[k])) * np.eye(len(point))[k]
-        ends = [seen(form_of(point + s * step, 3, (2, 3), 0.4), time).signal for s in (1, -1)]
+        ends = [
+            sensor_signal(form_of(point + s * step, 3, (2, 3), 0.4), time).signal for s in (1, -1)
+        ]
         slope = (ends[0] - ends[1]) / (2 * step[k])
         np.testing.assert_allclose(found.jacobian[:, k], slope, atol=2e-5 * np.abs(slope).max())
 
@@ -115,7 +117,7 @@ def test_bad_records_are_refused(decay):
         sj.methods.ssm(time, velocity, terms=8)
 
 
-def test_growth_is_no_mode(decay):
+def test_growth_is_not_a_mode(decay):
     time, velocity = decay
     result = sj.methods.ssm(time, velocity[::-1].copy(), terms=3)
     assert not result.found.any()

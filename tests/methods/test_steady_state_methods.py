@@ -1,4 +1,4 @@
-"""Methods that read steady states, against oscillators whose answers are written down.
+"""Methods that read steady states, against oscillators with known backbone and damping.
 
 States at displacement X are those of Z(X, Ω) X = F with Z = ω̃²(X)(1 + iη(X)) − Ω² (unit modal
 mass): Ω is chosen, F follows, or F is chosen and Ω² = ω̃² ± √(F²/X² − η²ω̃⁴). Nothing is solved.
@@ -17,14 +17,14 @@ HARDENING, LOSS, MORE_LOSS = 4e9, 0.006, 3.0  # ω̃² per m², η at rest, η p
 METHODS = ("concerto", "arslan_ozguven", "rct", "harmonic_force_surface", "phase_resonance")
 
 
-def square_of(size):
+def square_of(x):
     """ω̃² at a displacement."""
-    return REST**2 + HARDENING * size**2
+    return REST**2 + HARDENING * x**2
 
 
-def loss_of(size):
+def loss_of(x):
     """η at a displacement."""
-    return LOSS + MORE_LOSS * size
+    return LOSS + MORE_LOSS * x
 
 
 def modes_of(shape=1.0, participation=1.0):
@@ -32,7 +32,7 @@ def modes_of(shape=1.0, participation=1.0):
 
 
 def table(level, frequency, stiffness, displacement):
-    """Steady states from F = Z X, displacement real: everything is then turned to the force."""
+    """Steady states from F = Z X, displacement real: phases are then referred to the force."""
     force = stiffness * displacement
     velocity = 1j * frequency * displacement * np.abs(force) / force
     return sj.measure.steady_states(
@@ -46,33 +46,33 @@ def constant_force(forces=(0.05, 0.1, 0.2), fractions=(0.3, 0.5, 0.7, 0.9, 0.98)
     for level, force in enumerate(forces, 1):
         grid = np.linspace(1e-9, 1e-2, 200_001)
         peak = grid[np.argmax(grid * loss_of(grid) * square_of(grid) > force)]
-        for size in peak * np.array(fractions):
-            half = np.sqrt((force / size) ** 2 - (loss_of(size) * square_of(size)) ** 2)
+        for x in peak * np.array(fractions):
+            half = np.sqrt((force / x) ** 2 - (loss_of(x) * square_of(x)) ** 2)
             for side in sides:
-                rows.append((level, np.sqrt(square_of(size) + side * half), size))
-    level, frequency, size = np.array(rows).T
-    stiffness = square_of(size) * (1 + 1j * loss_of(size)) - frequency**2
-    return table(level, frequency, stiffness, size)
+                rows.append((level, np.sqrt(square_of(x) + side * half), x))
+    level, frequency, x = np.array(rows).T
+    stiffness = square_of(x) * (1 + 1j * loss_of(x)) - frequency**2
+    return table(level, frequency, stiffness, x)
 
 
 def constant_response(sizes=(1e-4, 3e-4, 6e-4, 1e-3), points=21):
     """Levels of constant displacement."""
-    size = np.repeat(sizes, points)
+    x = np.repeat(sizes, points)
     steps = np.tile(np.linspace(-2.3, 2.4, points), len(sizes))
-    frequency = np.sqrt(square_of(size)) * (1 + steps * loss_of(size) / 2)
-    stiffness = square_of(size) * (1 + 1j * loss_of(size)) - frequency**2
-    return table(np.repeat(np.arange(len(sizes)) + 1, points), frequency, stiffness, size)
+    frequency = np.sqrt(square_of(x)) * (1 + steps * loss_of(x) / 2)
+    stiffness = square_of(x) * (1 + 1j * loss_of(x)) - frequency**2
+    return table(np.repeat(np.arange(len(sizes)) + 1, points), frequency, stiffness, x)
 
 
 def errors(result):
-    """Relative errors of frequency and damping against what was written down."""
+    """Relative errors of frequency and damping against the exact curves."""
     found = result.found
     velocity = np.asarray(result.velocity)[found]
     natural = np.asarray(result.natural_frequency)[found]
-    size = velocity / natural
-    true = np.sqrt(square_of(size))
+    x = velocity / natural
+    true = np.sqrt(square_of(x))
     ratio = np.asarray(result.damping_ratio)[found]
-    return np.abs(natural / true - 1).max(), np.abs(ratio / (loss_of(size) / 2) - 1).max()
+    return np.abs(natural / true - 1).max(), np.abs(ratio / (loss_of(x) / 2) - 1).max()
 
 
 def test_concerto_finds_the_mode_of_two_states_of_equal_displacement():
@@ -83,15 +83,15 @@ def test_concerto_finds_the_mode_of_two_states_of_equal_displacement():
 
 
 def test_concerto_needs_no_modal_constant():
-    """A gain and a turned phase of the sensor leave λ alone where nothing is interpolated."""
+    """Gain and phase errors of the sensor do not affect λ where nothing is interpolated."""
     data = constant_force()
-    turned = table(
+    rotated = table(
         data.level,
         np.asarray(data.frequency),
         0.7 * np.asarray(data.force / (data.velocity[:, 0] / (1j * data.frequency))),
         np.abs(np.asarray(data.velocity[:, 0]) / np.asarray(data.frequency)),
     )
-    assert max(errors(sj.methods.concerto(turned, modes_of()))) < 1e-7
+    assert max(errors(sj.methods.concerto(rotated, modes_of()))) < 1e-7
 
 
 def test_response_control_is_a_linear_mode_at_each_level():
@@ -102,7 +102,7 @@ def test_response_control_is_a_linear_mode_at_each_level():
         assert max(errors(result)) < 1e-6
 
 
-def test_held_displacements_are_no_pairs():
+def test_controlled_displacements_are_not_pairs():
     result = sj.methods.concerto(constant_response(), modes_of())
     assert list(result.status) == 4 * [int(MethodStatus.AMPLITUDE_HELD)]
 
@@ -117,27 +117,27 @@ def test_levels_of_constant_force_are_cut_at_equal_displacement():
     assert damping < 5e-3
 
 
-def test_a_cut_of_the_force_surface_has_the_parts_that_a_sweep_jumps_over():
+def test_a_cut_of_the_force_surface_has_the_branch_that_a_sweep_jumps_over():
     sizes = np.linspace(5e-5, 1.5e-3, 60)
     frequency = np.linspace(REST, np.sqrt(square_of(sizes[-1])), 80)
-    size, omega = (one.ravel() for one in np.meshgrid(sizes, frequency, indexing="ij"))
-    stiffness = square_of(size) * (1 + 1j * loss_of(size)) - omega**2
+    x, omega = (one.ravel() for one in np.meshgrid(sizes, frequency, indexing="ij"))
+    stiffness = square_of(x) * (1 + 1j * loss_of(x)) - omega**2
     level = np.repeat(np.arange(len(sizes)), len(frequency))
-    surface = sj.methods.force_surface(table(level, omega, stiffness, size), modes_of())
+    surface = sj.methods.force_surface(table(level, omega, stiffness, x), modes_of())
     force = 1.0
     at, amplitude = surface.cut(force)
-    held = np.abs(square_of(amplitude) * (1 + 1j * loss_of(amplitude)) - at**2) * amplitude
-    assert np.abs(held / force - 1).max() < 0.02
+    required = np.abs(square_of(amplitude) * (1 + 1j * loss_of(amplitude)) - at**2) * amplitude
+    assert np.abs(required / force - 1).max() < 0.02
     assert np.bincount(np.unique(at, return_inverse=True)[1]).max() == 3
 
 
 def test_phase_resonance_reads_frequency_and_damping_where_the_phase_is_zero():
     steps = np.linspace(-0.3, 0.34, 4)
-    size = np.repeat([2e-4, 5e-4], len(steps))
-    frequency = np.sqrt(square_of(size)) * (1 + np.tile(steps, 2) * loss_of(size) / 2)
-    stiffness = square_of(size) * (1 + 1j * loss_of(size)) - frequency**2
+    x = np.repeat([2e-4, 5e-4], len(steps))
+    frequency = np.sqrt(square_of(x)) * (1 + np.tile(steps, 2) * loss_of(x) / 2)
+    stiffness = square_of(x) * (1 + 1j * loss_of(x)) - frequency**2
     shape, participation = -0.5, 2.0  # modal mass 1 at the sensor, which looks the other way
-    data = table(np.repeat([1, 2], len(steps)), frequency, -stiffness, size)
+    data = table(np.repeat([1, 2], len(steps)), frequency, -stiffness, x)
     result = sj.methods.phase_resonance(data, modes_of(shape, participation))
     assert result.found.all()
     frequency_error, damping_error = errors(result)
@@ -152,14 +152,14 @@ def test_describing_function_of_a_spring_in_a_chain():
     modes = sj.model.linear_modes(
         np.sqrt(squares), [1e-12, 1e-12], shapes[[1]], shapes[0], mode_of_interest=0
     )
-    size = np.array([1e-3, 2e-3, 3e-3])
-    v = 3e9 * size**2 + 1j * (40 + 2e4 * size)
+    x = np.array([1e-3, 2e-3, 3e-3])
+    v = 3e9 * x**2 + 1j * (40 + 2e4 * x)
     frequency = np.sqrt(squares[0]) * np.array([0.97, 1.01, 1.04])
     forces = []
     for one, omega in zip(v, frequency, strict=True):
         dynamic = stiffness - omega**2 * np.eye(2) + np.diag([0.0, one])
         forces.append(1 / np.linalg.inv(dynamic)[1, 0])  # N on the first mass per m of the second
-    data = table([1, 2, 3], frequency, np.array(forces), size)
+    data = table([1, 2, 3], frequency, np.array(forces), x)
     found = describing_function(sensor_states(data, modes), modes)
     np.testing.assert_allclose(found, v, rtol=1e-9)
     result = sj.methods.arslan_ozguven(data, modes)
@@ -168,7 +168,7 @@ def test_describing_function_of_a_spring_in_a_chain():
 
 
 @pytest.mark.parametrize("method", [sj.methods.concerto, sj.methods.arslan_ozguven])
-def test_stated_errors_are_carried_to_the_answers(method):
+def test_stated_errors_are_propagated(method):
     """1σ against the scatter of noisy repeats, at the level's own amplitudes."""
     clean = constant_force(forces=(0.1,), fractions=(0.45, 0.55, 0.65, 0.75))
     rng = np.random.default_rng(4)
@@ -176,25 +176,25 @@ def test_stated_errors_are_carried_to_the_answers(method):
     own = {"velocity_std": 0.003 * np.abs(velocity), "phase_std": np.full(velocity.shape, 0.006)}
     score = []
     for _ in range(200):
-        amplitude, turn = rng.standard_normal((2, *velocity.shape))
-        noisy = velocity * (1 + 0.003 * amplitude) * np.exp(0.006j * turn)
+        amplitude, phase = rng.standard_normal((2, *velocity.shape))
+        noisy = velocity * (1 + 0.003 * amplitude) * np.exp(0.006j * phase)
         data = sj.measure.steady_states(
             *(np.asarray(clean.level), np.asarray(clean.frequency), np.asarray(clean.force)),
             noisy,
             **own,
         )
         result = method(data, modes_of())
-        size = result.velocity / result.natural_frequency
+        x = result.velocity / result.natural_frequency
         score += [
-            (result.natural_frequency - np.sqrt(square_of(size))) / result.natural_frequency_std,
-            (result.damping_ratio - loss_of(size) / 2) / result.damping_ratio_std,
+            (result.natural_frequency - np.sqrt(square_of(x))) / result.natural_frequency_std,
+            (result.damping_ratio - loss_of(x) / 2) / result.damping_ratio_std,
         ]
     frequency, damping = np.concatenate(score[::2]), np.concatenate(score[1::2])
     for one in (frequency, damping):
         assert 0.7 < np.sqrt(np.nanmean(one**2)) < 1.4
 
 
-def test_a_level_that_jumps_before_resonance_has_no_answer():
+def test_a_level_that_jumps_before_resonance_has_no_point():
     data = constant_force(forces=(0.1,), sides=(-1,))
     result = sj.methods.phase_resonance(data, modes_of())
     assert list(result.status) == [int(MethodStatus.NO_RESONANCE)]
@@ -203,7 +203,7 @@ def test_a_level_that_jumps_before_resonance_has_no_answer():
     assert np.isnan(result.natural_frequency).all()
 
 
-def test_methods_that_cannot_run_say_why_and_the_others_run():
+def test_methods_that_cannot_run_give_a_reason_and_the_others_run():
     data = constant_force()
     volts = sj.measure.steady_states(
         np.asarray(data.level),
@@ -221,6 +221,6 @@ def test_methods_that_cannot_run_say_why_and_the_others_run():
         sj.methods.compare_methods(data, modes_of(), ["hilbert"])
     found = sj.methods.compare_methods(data, modes_of())
     assert {one.method for one in found.results} == {"snrm", *METHODS}
-    # A table alone: methods of records are named with what they need.
+    # A table only: methods for records state what they need.
     assert set(found.stopped) == {"resonant_decay", "restoring_force", "ssm", "pnlss"}
     assert all("a time record" in why for why in found.stopped.values())

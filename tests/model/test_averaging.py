@@ -15,14 +15,14 @@ from snrmjax.model.effects import make_effect
 AMPLITUDE = np.array([0.3, 0.5, 0.9, 4.0])
 FREQUENCY = np.array([2.0, 3.0, 0.7, 5.0])
 SAMPLES = 1024
-# The trapezoidal rule is exact for polynomials; a kink costs about h²/12 times the jump of the
+# The trapezoidal rule is exact for polynomials; a corner costs about h²/12 times the jump of the
 # slope over the average itself, a jump (which lies midway between samples) h²/24.
 EXACT = 1e-12
 NONSMOOTH_POINT = (2 * np.pi / SAMPLES) ** 2
 
 
 def engaged(amplitude, gap=0.4):
-    """1 − (2/π)(asin a + a√(1−a²)), a = gap/Q: the share of a spring beyond ±gap."""
+    """1 − (2/π)(asin a + a√(1−a²)), a = gap/Q: the fraction of a spring beyond ±gap."""
     a = np.minimum(gap / amplitude, 1.0)
     return 1 - 2 / np.pi * (np.arcsin(a) + a * np.sqrt(1 - a**2))
 
@@ -119,7 +119,7 @@ def test_amplitudes_and_frequencies_broadcast():
     np.testing.assert_allclose(damping[:, 1], 1.3 * AMPLITUDE**2 / 4, rtol=EXACT)
 
 
-@pytest.mark.parametrize(("kind", "kinks"), [("gap_stiffness", 2), ("one_sided_stop", 1)])
+@pytest.mark.parametrize(("kind", "corners"), [("gap_stiffness", 2), ("one_sided_stop", 1)])
 def test_contacts_are_sharp_and_exact_between_samples(kind, nonsmooth_points):
     stiffness, gap = 1.3, 0.4
     effect = make_effect(kind, {"stiffness": stiffness, "gap": gap})
@@ -160,7 +160,7 @@ def test_a_kink_converges_with_the_square_of_the_step():
         )
         for n in (64, 1024)
     ]
-    # 16 times the samples: a factor of 256 up to where the kink lies between two samples (a
+    # 16 times the samples: a factor of 256 up to where the corner lies between two samples (a
     # factor of about 12 either way); first-order convergence would leave 16.
     assert errors[1] < errors[0] / 20
 

@@ -1,4 +1,4 @@
-"""What effects state about themselves, against their forces and against their dimensions."""
+"""Metadata of effects against their forces and their dimensions."""
 
 import re
 from typing import ClassVar
@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
-from snrmjax.model.library.confounders import CONFOUNDERS
 
 from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
@@ -23,6 +22,7 @@ from snrmjax.model.effect_metadata import (
 )
 from snrmjax.model.effect_shape import computed_shape, shape_of, starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.library.confounders import CONFOUNDERS
 from snrmjax.numerics.rules import POSITIVE
 
 FORCES = [kind for kind, effect in EFFECTS.items() if issubclass(effect, AbstractForce)]
@@ -36,17 +36,17 @@ SCALES = MotionScales(
 @pytest.mark.parametrize("kind", [k for k in FORCES if "gap" not in effect_parameters(k)])
 def test_a_stated_shape_is_that_of_the_force(kind):
     effect = EFFECTS[kind]
-    stated, found = effect.shape, computed_shape(effect)
+    stated, result = effect.shape, computed_shape(effect)
     if kind == "jenkins_slider":  # nor does a slip displacement of 1
-        assert found is None
+        assert result is None
         return
-    # A memory shows in no cycle, and a law of several orders has its own power.
-    assert found.part == stated.part
-    assert found.symmetry == stated.symmetry
-    assert found.strength_order == stated.strength_order
-    assert found.argument in (stated.argument, Argument.HISTORY)
+    # One cycle does not reveal internal variables, and a law of several orders has its own power.
+    assert result.part == stated.part
+    assert result.symmetry == stated.symmetry
+    assert result.strength_order == stated.strength_order
+    assert result.argument in (stated.argument, Argument.HISTORY)
     if stated.factor is not None:
-        assert found.power == pytest.approx(stated.power, abs=1e-3)
+        assert result.power == pytest.approx(stated.power, abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", [k for k in FORCES if EFFECTS[k].shape.factor is not None])
@@ -89,7 +89,7 @@ def test_an_effect_is_described(kind):
     assert effect.shape is not None
 
 
-def test_every_confusion_has_those_whom_it_confuses():
+def test_every_confounder_has_effects():
     assert len(set(CONFOUNDERS)) == len(CONFOUNDERS)
     for one in CONFOUNDERS:
         members = [kind for kind, effect in EFFECTS.items() if one in effect.confounders]

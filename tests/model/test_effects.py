@@ -123,7 +123,7 @@ def test_force_slopes_and_symmetry(kind):
     np.testing.assert_array_equal(force[0], effect.force(q[0], v[0]))  # scalars as well
 
     # Central differences with a step of 1e-5: truncation h²/6·|f'''| ≤ 1e-10·20 and rounding
-    # 1e-16·16/1e-5. The states keep that far from the kinks, where the slope must be finite.
+    # 1e-16·16/1e-5. The states keep that far from the corners, where the slope must be finite.
     step = 1e-5
     smooth_q, smooth_v = np.asarray(q) != 0, np.asarray(v) != 0
     by_difference = [(by_hand(a + step, b) - by_hand(a - step, b)) / (2 * step) for a, b in STATES]

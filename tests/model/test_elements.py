@@ -1,4 +1,4 @@
-"""Forces at points: against hand-written equations, and the files that hold them."""
+"""Forces at points: against hand-written equations, and their files."""
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
+from snrmjax.model.attachment import between, influence_text, influence_vector
 from snrmjax.model.effects import ELEMENTS
-from snrmjax.model.places import between, row_over_points, row_text
 from snrmjax.model.structures import simulated_structure
 
 MASS, STIFFNESS = np.diag([1.0, 2.0]), np.array([[3.0, -1.0], [-1.0, 2.0]])
@@ -25,7 +25,7 @@ def spring(value, at):
 
 
 def physical(model, q):
-    """Motions of the points from modal ones."""
+    """Displacements of the points from modal ones."""
     return np.asarray(q) @ np.asarray(model.modes.mode_shape).T
 
 
@@ -155,14 +155,14 @@ def test_a_linkage_is_a_spring_that_turns():
 
 
 def test_rows_in_words():
-    assert row_text(row_over_points({"tip": 2.0, "root": -1.0})) == "2 tip - root"
+    assert influence_text(influence_vector({"tip": 2.0, "root": -1.0})) == "2 tip - root"
     assert "cubic_stiffness at a - b: coefficient 2" in repr(
         two_masses(spring(2.0, between("a", "b")))
     )
 
 
 @pytest.mark.parametrize(
-    ("at", "complaint"),
+    ("at", "message"),
     [
         ((), "at least one point"),
         ({"a": 0.0}, "must be a number"),
@@ -172,8 +172,8 @@ def test_rows_in_words():
         ("c", r"acts at 'c', where the modes have no shape|'c', which does not exist"),
     ],
 )
-def test_places_that_do_not_exist_are_refused(at, complaint):
-    with pytest.raises(ValueError, match=complaint):
+def test_places_that_do_not_exist_are_refused(at, message):
+    with pytest.raises(ValueError, match=message):
         two_masses(spring(1.0, at))
 
 
@@ -183,5 +183,5 @@ def test_a_force_between_a_point_and_itself_is_refused():
 
 
 def test_what_is_no_force_acts_at_no_point():
-    with pytest.raises(ValueError, match="frequency_drift is no force"):
+    with pytest.raises(ValueError, match="frequency_drift is not a force"):
         sj.model.make_effect("frequency_drift", {"relative_drift": 0.1}, at="a")

@@ -95,7 +95,7 @@ def test_response_is_invariant_under_signs_order_and_units():
     wanted = response(modes, omega, force)
 
     def rebuilt(order=(0, 1, 2), sign=1.0, time=1.0, length=1.0):
-        """The same chain with its modes reordered and turned, in other units (kg unchanged)."""
+        """The same chain with its modes reordered, with other signs and units (kg unchanged)."""
         order = np.array(order)
         return linear_modes(
             np.asarray(modes.natural_frequency)[order] / time,

@@ -40,8 +40,8 @@ def pair(motion="absolute", effects=(), **along):
 
 def test_a_linear_structure_follows_its_matrices():
     omega, size = HERTZ * np.array([10.0, 15.9, 30.0]), 2.0
-    found = sj.model.linear_response(pair().modes, omega, size)
-    for w, velocity in zip(omega, np.asarray(found), strict=True):
+    result = sj.model.linear_response(pair().modes, omega, size)
+    for w, velocity in zip(omega, np.asarray(result), strict=True):
         dynamic = STIFFNESS - w**2 * MASS + 1j * w * DAMPING
         relative = np.linalg.solve(dynamic, -MASS @ np.ones(2) * size)
         np.testing.assert_allclose(velocity, 1j * w * relative, rtol=1e-9)
@@ -52,10 +52,10 @@ def test_a_linear_structure_follows_its_matrices():
 
 def test_points_that_turn_away_from_the_base_go_with_their_cosine():
     omega = 15.0 * HERTZ
-    found = sj.model.linear_response(pair(tip=-0.5).modes, omega, 1.0)
+    result = sj.model.linear_response(pair(tip=-0.5).modes, omega, 1.0)
     dynamic = STIFFNESS - omega**2 * MASS + 1j * omega * DAMPING
     relative = np.linalg.solve(dynamic, -MASS @ [1.0, -0.5])
-    np.testing.assert_allclose(found, 1j * omega * relative, rtol=1e-9)
+    np.testing.assert_allclose(result, 1j * omega * relative, rtol=1e-9)
 
 
 def test_a_nonlinear_response_closes_in_time():
@@ -122,7 +122,7 @@ def test_a_virtual_test_on_a_table_goes_through_its_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda text: text.replace('"absolute"', '"sideways"'), "absolute or relative"),
         (lambda text: text.replace("[base]", '[force]\nat = "tip"\n[base]'), r"both \[force\]"),
@@ -133,21 +133,21 @@ def test_a_virtual_test_on_a_table_goes_through_its_file(tmp_path):
         ),
         (
             lambda text: text.replace('"absolute"', '"absolute"\nalong = { tip = 0, root = 0 }'),
-            "moves no mode",
+            "excites no mode",
         ),
         (lambda text: text.replace('"absolute"', '"absolute"\nspeed = 1'), "speed"),
     ],
 )
-def test_what_a_base_cannot_be_is_said(tmp_path, change, said):
+def test_what_a_base_cannot_be_is_said(tmp_path, change, message):
     (tmp_path / "pair.toml").write_text(change(MODEL))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         sj.read_model(tmp_path / "pair.toml")
 
 
 def test_a_force_and_a_base_exclude_each_other():
-    with pytest.raises(ValueError, match="either a `force` or a `base`"):
+    with pytest.raises(ValueError, match="either a `force` or a moving `base`"):
         sj.model.from_matrices(MASS, None, STIFFNESS)
-    with pytest.raises(ValueError, match="say nothing of newtons"):
+    with pytest.raises(ValueError, match="no scale in newtons"):
         pair().modes.forced_at("tip")
     with pytest.raises(ValueError, match="must be 'absolute' or 'relative'"):
         sj.model.base_motion("absolut")

@@ -48,7 +48,7 @@ def single(frequency=2.0, potential=None, **effects):
 
 
 def with_all_effects():
-    """Two coupled modes; every effect without memory acts on the second, which is of interest."""
+    """Two coupled modes; every memoryless effect acts on the second, which is of interest."""
     memoryless = {k for k, e in EFFECTS.items() if issubclass(e, AbstractMemoryless)}
     assert set(ALL_EFFECTS) == memoryless
     return structure(
@@ -76,7 +76,7 @@ def test_effects_add_to_the_mode_of_interest_alone():
 
 def test_tangents_against_central_differences():
     model = with_all_effects()
-    # Away from the kinks of gap (0.4), stop (0.3) and the zeros of |q| and |q̇|.
+    # Away from the corners of gap (0.4), stop (0.3) and the zeros of |q| and |q̇|.
     q = jnp.array([[0.3, -0.8], [1.1, 0.7], [-0.4, 0.1]])
     v = jnp.array([[2.0, 0.4], [-0.3, -1.2], [0.1, 0.9]])
     step = 1e-5
@@ -95,7 +95,7 @@ def test_potential_energy_is_the_work_of_the_forces():
     model = with_all_effects()
     q = np.array([0.9, -0.8])
     # Work along the straight line from rest by the trapezoidal rule with 20001 samples, whose
-    # error at the kinks is below 1e-8; Gauss's 64 points leave about 1e-4 of a kinked force.
+    # error at the corners is below 1e-8; Gauss's 64 points leave about 1e-4 there.
     fraction = np.linspace(0, 1, 20001)[:, None]
     path = fraction * q
     forces = eqx.filter_jit(type(model).nonlinear_force)
@@ -170,25 +170,25 @@ def test_statics_know_linear_changes_and_no_friction():
         "iwan_microslip": {"coefficient": 2.0, "exponent": 1.5},
         "coulomb_friction": {"force": 5.0},
     }
-    found = equilibria(single(**effects))
-    places = sorted(float(e.displacement[0]) for e in found)
-    np.testing.assert_allclose(places, [-2, 0, 2], atol=1e-9)
-    assert [e.stable for e in found] == [True, False, False]
-    assert found[-1].energy == pytest.approx(4.84, rel=1e-9)
+    result = equilibria(single(**effects))
+    positions = sorted(float(e.displacement[0]) for e in result)
+    np.testing.assert_allclose(positions, [-2, 0, 2], atol=1e-9)
+    assert [e.stable for e in result] == [True, False, False]
+    assert result[-1].energy == pytest.approx(4.84, rel=1e-9)
     # Where the force changes by a tenth of the linear one; the grid is 6 % wide.
     scale = displacement_scale(single(**effects))
     assert scale[0] == pytest.approx(np.sqrt(0.1 * 4.84 / 1.21), rel=0.06)
     # The same by the roots of the potential's polynomial, without memoryless effects.
     del effects["cubic_stiffness"]
-    found = equilibria(single(potential={"1111": -1.21 / 4}, **effects))
-    places = sorted(float(e.displacement[0]) for e in found)
-    np.testing.assert_allclose(places, [-2, 0, 2], atol=1e-12)
+    result = equilibria(single(potential={"1111": -1.21 / 4}, **effects))
+    positions = sorted(float(e.displacement[0]) for e in result)
+    np.testing.assert_allclose(positions, [-2, 0, 2], atol=1e-12)
     assert displacement_scale(single(**effects)) == [1e-3]
     # k = ω²(1 − 0.9)² = 0.04 and the force 0.02 q(q − 1)(q − 2): 1 is unstable, but only with k.
     shift = {"linear_frequency_shift": {"relative_shift": -0.9}}
-    found = equilibria(single(potential={"111": -0.02, "1111": 0.005}, **shift))
-    np.testing.assert_allclose([e.displacement[0] for e in found], [0, 1, 2], atol=1e-12)
-    assert [e.stable for e in found] == [True, False, True]
+    result = equilibria(single(potential={"111": -0.02, "1111": 0.005}, **shift))
+    np.testing.assert_allclose([e.displacement[0] for e in result], [0, 1, 2], atol=1e-12)
+    assert [e.stable for e in result] == [True, False, True]
 
 
 # ----------------------------------------------------------------------------------- equilibria
@@ -197,13 +197,13 @@ def test_statics_know_linear_changes_and_no_friction():
 def test_equilibria_of_one_mode_are_the_roots_of_its_force():
     # ω²q − 5q³ + q⁵ = 0 with ω² = 4: q² = 1 or 4.
     model = single(potential={"1111": -5 / 4, "111111": 1 / 6})
-    found = equilibria(model)
+    result = equilibria(model)
     np.testing.assert_allclose(
-        sorted(float(e.displacement[0]) for e in found), [-2, -1, 0, 1, 2], atol=1e-12
+        sorted(float(e.displacement[0]) for e in result), [-2, -1, 0, 1, 2], atol=1e-12
     )
-    distance = [abs(float(e.displacement[0])) for e in found]
+    distance = [abs(float(e.displacement[0])) for e in result]
     assert distance == sorted(distance)
-    assert {round(float(e.displacement[0])): e.stable for e in found} == {
+    assert {round(float(e.displacement[0])): e.stable for e in result} == {
         0: True,
         1: False,
         -1: False,
@@ -211,7 +211,7 @@ def test_equilibria_of_one_mode_are_the_roots_of_its_force():
         -2: True,
     }
     # V = 2q² − (5/4)q⁴ + q⁶/6.
-    assert found[-1].energy == pytest.approx(8 - 20 + 64 / 6, abs=1e-11)
+    assert result[-1].energy == pytest.approx(8 - 20 + 64 / 6, abs=1e-11)
 
 
 def test_equilibria_of_two_modes_are_found_by_search():
@@ -229,11 +229,11 @@ def test_equilibria_of_two_modes_are_found_by_search():
             2,
         ),
     )
-    found = equilibria(model)
-    places = {tuple(np.rint(e.displacement / [1, scale]).astype(int)) for e in found}
-    assert places == {(a, b) for a in range(-2, 3) for b in range(-2, 3)}
-    assert len(found) == 25
-    for e in found:
+    result = equilibria(model)
+    positions = {tuple(np.rint(e.displacement / [1, scale]).astype(int)) for e in result}
+    assert positions == {(a, b) for a in range(-2, 3) for b in range(-2, 3)}
+    assert len(result) == 25
+    for e in result:
         exact = np.rint(e.displacement / [1, scale]) * [1, scale]
         np.testing.assert_allclose(e.displacement, exact, atol=1e-8)  # Newton's own tolerance
         assert e.stable == all(abs(k) != 1 for k in np.rint(e.displacement / [1, scale]))

@@ -1,4 +1,4 @@
-"""Programs take floating-point numbers as arguments: other values do not compile anew."""
+"""Compiled programs trace floating-point numbers: other values do not recompile."""
 
 import equinox as eqx
 import jax
@@ -12,14 +12,14 @@ from snrmjax.numerics.compiled import compiled, jitted, numbers_as_arrays
 
 @compiled
 def scaled(numbers, *, power, offset=None, name="plain"):
-    """A function of numbers in a tree, of a whole number, of None and of text."""
+    """A function of a tree of numbers, an integer, None and text."""
     total = sum(jnp.sin(value) ** power for value in numbers.values())
     return total if offset is None or name == "bare" else total + offset
 
 
 def test_other_floats_do_not_compile_anew(compilations):
     first = scaled({"a": 0.3, "b": 0.5 + 1j}, power=2, offset=1.0)
-    assert len(compilations) > 0  # and the count does count
+    assert len(compilations) > 0  # the counter works
     del compilations[:]
     for value in (0.1, -0.7, 2.0, np.float64(0.4), np.array(0.3)):
         found = scaled({"a": value, "b": 0.5 + 1j}, power=2, offset=2.0 * value)
@@ -52,9 +52,9 @@ class Line(eqx.Module):
     name: str = eqx.field(static=True, default="line")
 
     @jitted
-    def at(self, place, *, offset=0.0):
-        """Its height."""
-        return self.slope * place + offset
+    def at(self, x, *, offset=0.0):
+        """The ordinate at x."""
+        return self.slope * x + offset
 
 
 def test_methods_take_floats_as_arguments(compilations):

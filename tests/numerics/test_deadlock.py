@@ -1,4 +1,4 @@
-"""Batched linear algebra side by side in one program: some versions of jaxlib stand still in it."""
+"""Concurrent batched linear algebra in one program: some versions of jaxlib deadlock in it."""
 
 import os
 import subprocess
@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-# Independent factorisations of many matrices each, as in gradients through several implicit
-# solutions. jaxlib 0.10.0 to 0.11.0 runs each on a thread of XLA's pool, and there it waits for
-# pieces of its own that no thread of the pool is left to compute.
+# Independent batched factorisations, as in gradients through several implicit solutions. jaxlib
+# 0.10.0 to 0.11.0 runs each on a thread of XLA's pool, where it waits for subtasks that no thread
+# of the pool is free to compute.
 _SOLVES = """
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
@@ -23,7 +23,7 @@ assert np.isfinite(found).all()
 _LIMIT = 60  # s; takes 3
 
 
-@pytest.mark.skipif(os.cpu_count() == 1, reason="with one core nothing runs side by side")
+@pytest.mark.skipif(os.cpu_count() == 1, reason="with one core nothing runs in parallel")
 def test_gradients_of_many_solves_come_to_an_end():
     quick = os.environ | {"XLA_FLAGS": "", "JAX_PLATFORMS": "cpu"}  # as a user's process has them
     subprocess.run([sys.executable, "-c", _SOLVES], env=quick, check=True, timeout=_LIMIT)

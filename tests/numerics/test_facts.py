@@ -1,4 +1,4 @@
-"""Facts, their sentences, and statuses: every kind is worded, every message says something."""
+"""Facts, their sentences, and statuses: every kind has a wording, every status a message."""
 
 import ast
 import functools
@@ -20,23 +20,23 @@ PACKAGE = Path(snrmjax.__file__).parent
 
 @functools.cache
 def stated_facts():
-    """Every `Fact("kind", name=…)` of the package: place, kind, names of values."""
+    """Every `Fact("kind", name=…)` of the package: location, kind, names of values."""
     facts = []
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Fact":
-                place = f"{path.relative_to(PACKAGE)}:{node.lineno}"
-                assert isinstance(node.args[0], ast.Constant), f"{place}: a kind is a constant"
+                location = f"{path.relative_to(PACKAGE)}:{node.lineno}"
+                assert isinstance(node.args[0], ast.Constant), f"{location}: a kind is a constant"
                 names = {keyword.arg for keyword in node.keywords}
-                facts.append((place, node.args[0].value, names))
+                facts.append((location, node.args[0].value, names))
     return facts
 
 
 def test_every_fact_is_worded_from_values_that_it_has():
     stated, words = stated_facts(), wordings()
     assert stated
-    for place, kind, names in stated:
-        assert kind in words, f"{place}: {kind!r} stands in no table of report/sentences"
+    for location, kind, names in stated:
+        assert kind in words, f"{location}: {kind!r} is in no table of report/sentences"
         if None in names:  # values given as a mapping
             continue
         wording = words[kind]
@@ -48,15 +48,15 @@ def test_every_fact_is_worded_from_values_that_it_has():
             for _, piece, _, _ in string.Formatter().parse(wording)
             if piece is not None
         }
-        assert fields <= names, f"{place}: {kind!r} is worded with {fields - names}"
+        assert fields <= names, f"{location}: {kind!r} is worded with {fields - names}"
 
 
 def test_no_sentence_without_a_fact():
     assert set(wordings()) == {kind for _, kind, _ in stated_facts()}
 
 
-def test_templates_count_share_and_list(monkeypatch):
-    table = {"example": "{n:#state} of levels {levels}, {share:%.2g}"}
+def test_templates_count_list_and_print_percentages(monkeypatch):
+    table = {"example": "{n:#state} of levels {levels}, {fraction:%.2g}"}
     monkeypatch.setattr("snrmjax.report.sentences.wordings", lambda: table)
     fact = Fact("example", n=1, levels=(1, 2, 5), fraction=0.0512)
     assert sentence(fact) == str(fact) == "1 state of levels 1, 2 and 5, 5.1 %"

@@ -1,4 +1,4 @@
-"""Lanes: Collatz sequences, whose lengths differ much and are known, side by side."""
+"""Lanes: Collatz sequences in parallel, of very different and known lengths."""
 
 import jax
 import jax.numpy as jnp
@@ -12,21 +12,21 @@ START = np.array([27, 1, 2, 97, 7, 3, 16, 6, 19, 1, 54, 12, 5])
 
 
 def sequence(number):
-    """All numbers behind the first, to one."""
-    found = []
+    """All numbers after the first, down to one."""
+    numbers = []
     while number != 1:
         number = number // 2 if number % 2 == 0 else 3 * number + 1
-        found.append(number)
-    return found
+        numbers.append(number)
+    return numbers
 
 
 @jax.jit
-def begun(jobs, wanted):
+def initial(jobs, wanted):
     return in_rows((jnp.where(wanted, jobs, 1), jnp.zeros_like(jobs)))
 
 
 @jax.jit
-def advanced(jobs, states, idle):
+def advance(jobs, states, idle):
     def step(job, state):
         number, count = state
         number = jnp.where(number % 2 == 0, number // 2, 3 * number + 1)
@@ -42,7 +42,7 @@ def advanced(jobs, states, idle):
 @pytest.mark.parametrize("cores", [1, 2])
 def test_every_job_comes_to_its_own_end(lanes, cores, monkeypatch):
     monkeypatch.setattr(module, "cores", lambda: cores)
-    (last, count), rows = in_lanes(begun, advanced, START, lanes)
+    (last, count), rows = in_lanes(initial, advance, START, lanes)
     assert last.tolist() == [1] * len(START)
     exact = [sequence(int(number)) for number in START]
     assert count.tolist() == [len(numbers) for numbers in exact]
@@ -54,9 +54,9 @@ def test_every_job_comes_to_its_own_end(lanes, cores, monkeypatch):
 
 def test_lanes_stop_where_few_go_on():
     jobs = jnp.asarray(START[:4])
-    states = begun(jobs, jnp.ones(4, dtype=bool))
+    states = initial(jobs, jnp.ones(4, dtype=bool))
     # One is at its end from the start, 2 after one step; two lanes are left then.
-    _, _, (_, _, count) = advanced(jobs, states, jnp.array(2))
+    _, _, (_, _, count) = advance(jobs, states, jnp.array(2))
     assert count.tolist() == [1, 0, 1, 1]
-    _, _, (_, _, count) = advanced(jobs, states, jnp.array(0))
+    _, _, (_, _, count) = advance(jobs, states, jnp.array(0))
     assert count.tolist() == [10, 0, 1, 10]

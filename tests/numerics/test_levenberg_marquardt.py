@@ -21,9 +21,9 @@ class Point(NamedTuple):
 
 def decay(point):
     """A decay a·exp(−b t), not finite for b below zero."""
-    size, rate = point
+    amplitude, rate = point
     shape = np.exp(-rate * TIME) if rate >= 0 else np.full_like(TIME, np.nan)
-    return Point(size * shape - DATA, np.stack([shape, -size * TIME * shape], axis=1))
+    return Point(amplitude * shape - DATA, np.stack([shape, -amplitude * TIME * shape], axis=1))
 
 
 def fitted(starts, rule=RULE, bounds=ANYWHERE):
@@ -42,7 +42,7 @@ def test_every_start_ends_at_scipys_minimum():
     truth = least_squares(lambda p: decay(p).residuals, [1.0, 1.0], xtol=1e-15, ftol=1e-15)
     ends, _ = fitted([[1.0, 1.0], [5.0, 0.1], [0.2, 3.0]])
     for end in ends:
-        # Where the sum of squares no longer changes a point is known to half the digits.
+        # At a minimum of the sum of squares the point is known to half the digits.
         np.testing.assert_allclose(end.point, truth.x, rtol=1e-6)
         assert end.sum_of_squares == pytest.approx(2 * truth.cost, rel=1e-12)
         assert end.status in (MinimisationStatus.CONVERGED, MinimisationStatus.STALLED)
@@ -86,5 +86,5 @@ def test_a_step_that_promises_too_little_is_not_evaluated():
     assert end.status == MinimisationStatus.CONVERGED
     assert np.any(end.last_step)
     np.testing.assert_array_equal(end.point, near + end.last_step)
-    # Marquardt's damping leaves a thousandth of the way.
+    # Marquardt's damping shortens the step by a thousandth.
     np.testing.assert_allclose(end.point, best.point, rtol=1e-8)

@@ -1,4 +1,4 @@
-"""Small inputs that once went wrong, where they lie beside the project, each by its command."""
+"""Small inputs of former errors, each by its command, if the folder of cases exists."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ from snrmjax.io.laboratory import read_laboratory_file
 from snrmjax.io.tables import read_steady_states
 
 CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
-pytestmark = pytest.mark.skipif(not CASES.exists(), reason="no cases beside the project")
+pytestmark = pytest.mark.skipif(not CASES.exists(), reason="no folder of cases")
 POUND = 4.4482216152605
 
 
@@ -53,9 +53,9 @@ def test_a_labview_file_with_decimal_commas():
 
 
 def test_radians_of_a_list_of_units_and_ratios(tmp_path):
-    code, said = run_import(CASES / "mat_units_field_rad" / "fr.mat")
+    code, printed = run_import(CASES / "mat_units_field_rad" / "fr.mat")
     assert code == 0
-    assert "--force force --response amplitude --out" in said
+    assert "--force force --response amplitude --out" in printed
     found = run(
         "modes",
         CASES / "compound_unit_label" / "ratio_g.uff",
@@ -72,15 +72,15 @@ def test_channels_of_two_files_and_of_two_clocks(tmp_path):
     folder = CASES / "polytec_one_channel_a_file"
     files = folder / "force.txt", folder / "velocity.txt"
     words = ["--force", "Ref1 Force", "--response", "Vib Velocity", "--record", "broadband"]
-    code, said = run_import(*files, *words, "--out", tmp_path / "o")
-    assert code == 0, said
+    code, printed = run_import(*files, *words, "--out", tmp_path / "o")
+    assert code == 0, printed
     head = (tmp_path / "o" / "record.csv").read_text().splitlines()[0]
     assert head == "time_s,force_n,velocity_m_s"
     words = ["--force", "Force", "--response", "Acc:acceleration", "--record", "steps"]
-    code, said = run_import(
+    code, printed = run_import(
         CASES / "tdms_start_times" / "skew.tdms", *words, "--out", tmp_path / "t"
     )
-    assert code == 0, said
+    assert code == 0, printed
     states = read_steady_states(tmp_path / "t" / "measured.csv")
     at_50 = int(np.argmin(np.abs(np.asarray(states.frequency) - 100 * np.pi)))
     assert np.angle(np.asarray(states.velocity)[0, 0], deg=True) == pytest.approx(72, abs=0.5)

@@ -1,4 +1,4 @@
-"""Commands that mend what the check finds, run as they are printed."""
+"""Import commands that correct findings of the check, run as printed."""
 
 import json
 import re
@@ -14,7 +14,7 @@ import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.doctor.findings import Checkup, Finding, ImportCorrection
 from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
-from snrmjax.pipelines import check as mends
+from snrmjax.pipelines import check as pipeline
 
 RAW = "Freq [Hz],Load [N],Amp [{}],Phase [deg]\n"
 TOLD = ("--force", "Load", "--frequency", "Freq", "--phase", "Phase", "--sensor", "tip")
@@ -28,9 +28,9 @@ def run(*words):
     return done.output
 
 
-def pasted(mend, k=0):
-    """Run the k-th command of a mend."""
-    command = re.findall(r"`(snrmjax [^`]+)`", mend)[k]
+def pasted(correction, k=0):
+    """Run the k-th command of a correction."""
+    command = re.findall(r"`(snrmjax [^`]+)`", correction)[k]
     name, *words = shlex.split(command)
     assert name == "snrmjax"
     run(*words)
@@ -51,7 +51,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def checked(data, folder, *words):
-    """What the check says of a table of our own."""
+    """Findings of the check for a table of our own."""
     sj.io.write_steady_states("measured.csv", data)
     run("check", "measured.csv", "--model", "model.toml", *words, "--out", "checked")
     return json.loads((folder / "checked" / "check.json").read_text())
@@ -68,7 +68,7 @@ def checked(data, folder, *words):
         (lambda w, f, v: (f, v / (1j * w)), "--unit m "),
     ],
 )
-def test_a_table_of_our_own_is_mended(folder, change, words):
+def test_a_table_of_our_own_is_corrected(folder, change, words):
     level, w, f, v = states()
     first, *_ = checked(table(level, w, *change(w, f, noisy(v))), folder)
     assert words in pasted(first["mend"])
@@ -119,7 +119,7 @@ def test_several_units_of_one_factor_are_a_command_each(folder):
     assert kinds_of("mended/measured.csv", folder) == []
 
 
-def test_two_errors_of_our_own_table_are_mended_by_one_command(folder):
+def test_two_errors_of_our_own_table_are_corrected_by_one_command(folder):
     level, w, f, v = states()
     first, *_ = checked(table(level, w, f, noisy(v).conj() / 9.80665), folder)
     assert first["kind"] == "conjugated_response"
@@ -127,7 +127,7 @@ def test_two_errors_of_our_own_table_are_mended_by_one_command(folder):
     assert kinds_of("mended/measured.csv", folder) == []
 
 
-def test_two_errors_of_which_one_needs_the_other_are_mended_at_once(folder):
+def test_two_errors_of_which_one_needs_the_other_are_corrected_at_once(folder):
     """Amplitudes in g that an import has taken for velocities in m/s."""
     _, w, _, v = states()
     a = noisy(v) * 1j * w / 9.80665
@@ -137,8 +137,8 @@ def test_two_errors_of_which_one_needs_the_other_are_mended_at_once(folder):
     found = json.loads((folder / "checked" / "check.json").read_text())
     assert [one["kind"] for one in found[:2]] == ["acceleration_as_velocity", "wrong_unit"]
     assert '--unit "9.80665 m/s2" --out' in pasted(found[0]["mend"])
-    mended = sj.read_steady_states("taken/mended/measured.csv")
-    np.testing.assert_allclose(mended.velocity[:, 0], noisy(v), rtol=1e-6)
+    corrected = sj.read_steady_states("taken/mended/measured.csv")
+    np.testing.assert_allclose(corrected.velocity[:, 0], noisy(v), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -155,17 +155,17 @@ def test_two_errors_of_which_one_needs_the_other_are_mended_at_once(folder):
     ],
 )
 def test_options_of_a_laboratorys_files_are_those_of_their_map(correction, options):
-    read = mends.FilesRead(
+    read = pipeline.FilesRead(
         (Path("raw/a.csv"),), Path("raw/map.toml"), ImportMap((ResponseMap("a", "acceleration"),))
     )
     finding = Finding("wrong_unit", "", "", "Again.", (), (correction,))
-    (told,) = mends.with_imports(Checkup((finding,)), read).findings
+    (advised,) = pipeline.with_imports(Checkup((finding,)), read).findings
     line = f"snrmjax import raw/a.csv --map raw/map.toml {options} --out raw/mended"
-    assert str(told.advice) == (f"Again: `{line}`." if options else "Again.")
+    assert str(advised.advice) == (f"Again: `{line}`." if options else "Again.")
 
 
 @pytest.mark.long
-def test_the_whole_test_goes_on_with_what_is_mended(folder):
+def test_the_whole_test_runs_on_the_corrected_data(folder):
     _, w, _, v = states()
     (folder / "raw").mkdir()
     sj.io.write_model("raw/model.toml", model())

@@ -21,12 +21,12 @@ def responses(scale=1.0):
     """Mobility of one mode at its drive point."""
     omega = HERTZ * np.linspace(45, 55, 60)
     values = scale * 1j * omega / (OWN**2 - omega**2 + 2j * RATIO * OWN * omega)
-    place = {"point": "1", "direction": "+z"}
+    attachment = {"point": "1", "direction": "+z"}
     return frequency_responses(
         omega,
         values[None, None],
-        [Channel("tip", "velocity", "m/s", **place)],
-        [Channel("force", "force", "N", **place)],
+        [Channel("tip", "velocity", "m/s", **attachment)],
+        [Channel("force", "force", "N", **attachment)],
     )
 
 
@@ -68,7 +68,7 @@ def test_every_file_is_read_by_its_content(folder):
     ]
 
 
-def test_a_map_beside_a_table_of_other_names_is_used(tmp_path):
+def test_a_map_with_a_table_of_other_names_is_used(tmp_path):
     (tmp_path / "log.csv").write_text(
         "Freq [Hz],Load [N],V [mm/s],Phase [deg]\n49,1,111.8,26.565\n50,1,150,0\n51,1,100,-30\n"
     )
@@ -91,7 +91,7 @@ def test_what_people_wrote_and_a_map_assumed_is_kept_for_the_report(folder):
         '# note: 2 rows are incomplete.\nforce = "F"  # channel of the force\n'
         'phase_sign = "lead"  # assumed: lead: ahead (lead: ahead)\n'
     )
-    (folder / "sines.mat").unlink()  # of which the map would have to say more
+    (folder / "sines.mat").unlink()  # which the map does not assign
     texts = dict(read_test_files(folder).texts)
     assert texts["notes.txt"] == ("warm day",)
     assert texts["technician.txt"][0] == "sensor glued anew"
@@ -131,7 +131,7 @@ def test_a_folder_without_measurements_is_refused(tmp_path):
     with pytest.raises(ValueError, match="must be a folder"):
         read_test_files(tmp_path / "nowhere")
     (tmp_path / "model.toml").write_text(MODEL + SENSOR)
-    with pytest.raises(ValueError, match="holds nothing measured"):
+    with pytest.raises(ValueError, match="has no measurements"):
         read_test_files(tmp_path)
 
 
@@ -143,7 +143,7 @@ def test_another_model_may_be_named(folder, tmp_path_factory):
     assert dict(found.passed)["model.toml"] == "not used: the model is linear.toml"
 
 
-def test_a_rate_of_few_digits_is_asked_for(tmp_path):
+def test_a_rate_of_few_digits_must_be_stated(tmp_path):
     """0.000488 s may be any rate from 2048 to 2051 Hz."""
     head = ["LabVIEW Measurement", "Separator\tTab", "X_Columns\tNo", "***End_of_Header***", ""]
     head += ["Channels\t2", "Y_Unit_Label\tN\tm/s", "Delta_X\t0.000488\t0.000488"]
@@ -162,19 +162,19 @@ def test_a_rate_of_few_digits_is_asked_for(tmp_path):
     assert one.record.sampling_rate == 2050.0
 
 
-def test_a_map_that_does_not_fit_is_not_asked_for_once_more(tmp_path):
+def test_a_map_that_does_not_fit_is_named_in_the_error(tmp_path):
     folder = tmp_path / "test"
     folder.mkdir()
     (folder / "log.csv").write_text("Freq [Hz],Load [N],V [mm/s]\n49,1,111.8\n50,1,150\n")
     (tmp_path / "told.toml").write_text('force = "Load"\n[[response]]\nchannel = "V"\n')
     with pytest.raises(ValueError, match="where is the phase of V") as error:
         read_test_files(folder, map_file=tmp_path / "told.toml")
-    assert str(error.value).startswith("log.csv, read as told.toml says: ")
+    assert str(error.value).startswith("log.csv, read with told.toml: ")
     assert "--map" not in str(error.value)
     assert "Without a map" not in str(error.value)
 
 
-def test_a_map_elsewhere_takes_the_place_of_the_folders(tmp_path):
+def test_a_map_elsewhere_replaces_the_folders(tmp_path):
     folder = tmp_path / "test"
     folder.mkdir()
     (folder / "log.csv").write_text(

@@ -1,4 +1,4 @@
-"""A completed model that resonates elsewhere than the structure: the note says at which levels."""
+"""A completed model with a wrong resonance: the note states the levels."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Which tests are not diagnosed, and that page and print say so."""
+"""Tests that are not diagnosed, as page and messages report."""
 
 import numpy as np
 import pytest
@@ -46,8 +46,8 @@ def test_going_on_in_spite_of_a_wrong_unit_ends_without_a_diagnosis(tmp_path):
     assert done.exit_code == 0, done.exception
     page = (out / "report.html").read_text()
     for text in (" ".join(done.output.split()), page):
-        assert "The diagnosis was left out, as it would explain an error" in text
-    assert "The diagnosis was left out: the first note says why." in page
+        assert "The diagnosis was skipped, as it would attribute an error" in text
+    assert "The diagnosis was skipped: the first note gives the reason." in page
     assert not (out / "diagnose").exists()
     assert np.isfinite(
         np.loadtxt(out / "identify" / "backbone.csv", delimiter=",", skiprows=1)

@@ -29,15 +29,15 @@ def test_identification_obeys_or_refuses_every_option(files, tmp_path):
         written(found, tmp_path / "out", title="One")
     )
     assert found.resonances[0].force == 1.0
-    for wrong, said in (
+    for wrong, message in (
         ({"robust": True}, "`--robust` belongs to a joint fit"),
-        ({"knots": 4, "fit": "auto"}, "`--knots` has no effect beside `--fit`"),
+        ({"knots": 4, "fit": "auto"}, "`--knots` has no effect with `--fit`"),
         ({"extrapolate": 2.0}, "`--extrapolate` belongs to predictions"),
         ({"predict_force": (-1.0,)}, "`--predict-force` must be above zero, but is -1 N"),
         ({"predict_at": "tip"}, "`--predict-at` belongs to predictions under a force"),
         ({"predict_drive": (1.0,)}, "is for data with a drive voltage"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             sj.pipelines.identify_test(data, model, **wrong)
 
 

@@ -79,15 +79,15 @@ def test_what_the_check_finds_is_a_question(tmp_path):
     )
     write_states(tmp_path / "states.csv", np.conj)
     done = CliRunner().invoke(app, ["test", str(tmp_path), "--out", str(tmp_path / "out")])
-    assert "is this meant? conjugated response" in str(done.exception)
-    mend = f"snrmjax import {tmp_path}/states.csv --phase-sign lag --out {tmp_path}/mended"
-    assert f"`{mend}`" in str(done.exception)
-    assert "To go on nevertheless: `--go-on`." in str(done.exception)
+    assert "is this intended? conjugated response" in str(done.exception)
+    correction = f"snrmjax import {tmp_path}/states.csv --phase-sign lag --out {tmp_path}/mended"
+    assert f"`{correction}`" in str(done.exception)
+    assert "To continue nevertheless: `--go-on`." in str(done.exception)
     assert not (tmp_path / "out").exists()
 
 
 def test_states_that_two_files_hold_are_a_question(tmp_path):
-    """As where an import is written beside the raw files: its states would count twice."""
+    """An import written into the folder of the raw files: its states would count twice."""
     (tmp_path / "model.toml").write_text(
         'name = "one"\n[[mode]]\nfrequency_hz = 50.0\ndamping_ratio = 0.01\n'
         "shape = { tip = 1.0 }\nparticipation = 1.0\n"
@@ -95,15 +95,15 @@ def test_states_that_two_files_hold_are_a_question(tmp_path):
     write_states(tmp_path / "measured.csv")
     write_states(tmp_path / "states.csv")
     done = CliRunner().invoke(app, ["test", str(tmp_path), "--out", str(tmp_path / "out")])
-    said = str(done.exception)
-    assert "which of measured.csv and states.csv is the test? Both hold the same 36" in said
+    printed = str(done.exception)
+    assert "which of measured.csv and states.csv is the test? Both hold the same 36" in printed
     names = [one.file for one in read_test_files(tmp_path).states]
     # A repetition has other noise: 0.1 % of it is enough.
     write_states(tmp_path / "states.csv", lambda v: 1.001 * v)
     _refuse_doubled(names, [one.states for one in read_test_files(tmp_path).states])
 
 
-def test_a_file_without_a_sensor_is_said_to_be_the_models_only_one(tmp_path):
+def test_a_file_without_a_sensor_is_assigned_to_the_models_only_one(tmp_path):
     (tmp_path / "model.toml").write_text(
         'name = "one"\n[[mode]]\nfrequency_hz = 50.0\ndamping_ratio = 0.01\n'
         "shape = { tip = 1.0 }\nparticipation = 1.0\n"
@@ -147,10 +147,10 @@ def test_steps_left_out_at_import_are_counted(tmp_path):
     steps = time_recording(np.concatenate(pieces, axis=1), channels, rate)
     write_matlab(tmp_path / "run1.mat", recordings=[steps])
     folder = tmp_path / "test"
-    told = ("--force", "load", "--response", "tip", "--sensor", "tip", "--record", "steps")
-    code, said = run_import(tmp_path / "run1.mat", *told, "--out", folder)
-    assert code == 0, said
-    assert "7 of 10 steps used; left out: 3 unsettled" in " ".join(said.split())
+    assigned = ("--force", "load", "--response", "tip", "--sensor", "tip", "--record", "steps")
+    code, printed = run_import(tmp_path / "run1.mat", *assigned, "--out", folder)
+    assert code == 0, printed
+    assert "7 of 10 steps used; left out: 3 unsettled" in " ".join(printed.split())
     files = read_test_files(folder)
     assert _used_steps(files, []) == StepCounts(7, {"unsettled": 3})
     assert steps_of_map(folder / "map.toml") == files.steps_at_import
@@ -160,13 +160,13 @@ def test_steps_left_out_at_import_are_counted(tmp_path):
     )
 
 
-def test_each_stage_is_told_with_its_seconds():
-    told = []
-    stage = _Stages(lambda name, seconds: told.append((name, seconds)))
+def test_each_stage_is_reported_with_its_seconds():
+    reported = []
+    stage = _Stages(lambda name, seconds: reported.append((name, seconds)))
     stage.ends("check")
     stage.ends("diagnosis")
-    assert [name for name, _ in told] == ["check", "diagnosis"]
-    assert all(seconds >= 0 for _, seconds in told)
+    assert [name for name, _ in reported] == ["check", "diagnosis"]
+    assert all(seconds >= 0 for _, seconds in reported)
 
 
 def duffing_record(force, rng):
@@ -198,8 +198,11 @@ def duffing_record(force, rng):
         state, phase = found.sol(dwell), phase + omega * dwell
     both = np.concatenate(values, axis=1)
     both += 1e-3 * np.abs(both).max(axis=1)[:, None] * rng.standard_normal(both.shape)
-    place = {"point": "1", "direction": "+z"}
-    channels = [Channel("force", "force", "N", **place), Channel("tip", "velocity", "m/s", **place)]
+    attachment = {"point": "1", "direction": "+z"}
+    channels = [
+        Channel("force", "force", "N", **attachment),
+        Channel("tip", "velocity", "m/s", **attachment),
+    ]
     return time_recording(both, channels, RATE)
 
 
@@ -219,7 +222,7 @@ def test_a_folder_of_raw_files_gives_the_backbone_of_its_oscillator(tmp_path):
     assert json.loads((out / "check.json").read_text()) == []
     page = (out / "report.html").read_text()
     assert "mode of interest" in page
-    assert "linear mode<" not in page  # without errors, beside that with them
+    assert "linear mode<" not in page  # not a second one without errors
     for heading in ("Files", "Check", "States", "Backbone: ", "Diagnosis: "):
         assert f">{heading}" in page
     rows = np.genfromtxt(out / "identify" / "backbone.csv", delimiter=",", names=True)

@@ -11,8 +11,8 @@ from matplotlib.colors import to_rgba
 from truths.printed_page import unreadable
 
 import snrmjax as sj
-from snrmjax.diagnose.location.laws_at_places import PlacedLaw
-from snrmjax.diagnose.location.where import Localisation, PlacedForce
+from snrmjax.diagnose.location.laws_at_points import LocatedLaw
+from snrmjax.diagnose.location.where import Localisation, LocatedForce
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.io.units import HERTZ
@@ -204,10 +204,10 @@ def test_limits_and_losing_candidates_are_folded_away(drag, pictures):
 @pytest.mark.parametrize(
     ("verdict", "words"),
     [
-        ("none", "Nothing is missing that these data could show"),
+        ("none", "No missing effect is detected in these data"),
         ("named", "Quadratic damping explains "),
-        ("unknown", "no effect of the library explains reliably"),
-        ("noise_rejected", "The stated noise does not fit"),
+        ("unknown", "no effect in the library explains reliably"),
+        ("noise_rejected", "The stated noise is inconsistent"),
     ],
 )
 def test_each_verdict_is_one_plain_sentence(drag, verdict, words):
@@ -224,7 +224,7 @@ def test_rivals_are_told_where_there_are_some(drag):
     )
     assert unclear.verdict_sentence.startswith(
         "The model lacks quadratic damping, cubic damping or Jenkins slider, and these data cannot "
-        "tell which"
+        "distinguish them"
     )
 
 
@@ -260,9 +260,9 @@ def test_predictions_of_unseen_levels_are_told_from_those_of_the_completed_model
     html = html_of(drag[2], (levels, figures)).replace("\u00a0", " ")
     own, out = f"{unseen.completed.frequency:.5g} Hz", f"{unseen.after.frequency:.5g} Hz"
     assert f"completed model: {own}" in html
-    assert f"predicted without having seen level {unseen.level}: {out}" in html
-    assert "predicted without having seen the level" in html
-    table = html[html.index("predicted without having seen the level") :]
+    assert f"predicted without level {unseen.level}: {out}" in html
+    assert "predicted without this level" in html
+    table = html[html.index("predicted without this level") :]
     table = table[: table.index("</table>")]
     assert len(set(re.findall(r"\d ([mµ]?m/s)", table))) == 1
 
@@ -286,15 +286,15 @@ def test_the_terminal_has_what_was_found_with_its_error_and_unit(drag):
 
 def test_a_law_at_a_place_has_physical_units_in_the_terminal(drag):
     given, _, found = drag
-    law = PlacedLaw("cubic_stiffness", 1.0, 10, {"coefficient": 2e4}, {"coefficient": 300.0})
-    place = PlacedForce("tip", (("tip", 1.0),), 0.9, law, {"cubic_stiffness": 1.0})
+    law = LocatedLaw("cubic_stiffness", 1.0, 10, {"coefficient": 2e4}, {"coefficient": 300.0})
+    place = LocatedForce("tip", (("tip", 1.0),), 0.9, law, {"cubic_stiffness": 1.0})
     other = place._replace(name="everywhere", row=None, probability=0.1)
     where = Localisation(
         *((place, other), given, None, ("tip", "everywhere"), np.array([0.9, 0.1])), misfit=1.0
     )
     poor = dataclasses.replace(found, verdict=Verdict.UNKNOWN)
     lines = told.headline(DiagnosedTest(poor, given, where=where))
-    assert "found (± 1σ): cubic stiffness at tip, coefficient 20000 ± 300 N/m³" in lines
+    assert "identified (± 1σ): cubic stiffness at tip, coefficient 20000 ± 300 N/m³" in lines
 
 
 def test_a_best_attempt_and_its_errors_are_called_so(drag, pictures):
@@ -306,7 +306,7 @@ def test_a_best_attempt_and_its_errors_are_called_so(drag, pictures):
     assert "The best attempt, which does not explain the data" in html
     assert "× noise; the ± holds only if the noise is as stated" in html
     assert "holds only if the noise is as stated" in repr(poor)
-    assert "the misfit that is left is 170 times that noise" in html
+    assert "the remaining misfit is 170 times that noise" in html
 
 
 def test_what_these_data_cannot_show_is_said_to_be_so(drag, pictures):
@@ -327,16 +327,16 @@ def test_gains_of_candidates_have_sensible_digits():
 
 def test_levels_that_hold_the_response_are_told_and_their_states_pale(drag, pictures):
     data = drag[1]
-    assert not told.holds_response(data, pictures[0])
+    assert not told.is_response_controlled(data, pictures[0])
     assert "hold the response" not in html_of(drag[2], pictures)
     force = np.asarray(data.force)
     swept = dataclasses.replace(data, force=force * np.linspace(0.7, 1.3, len(force)))
-    assert not told.holds_response(swept, pictures[0])  # its velocities change far more
+    assert not told.is_response_controlled(swept, pictures[0])  # its velocities change far more
     velocity, level = np.asarray(data.velocity), np.asarray(data.level)
     size = np.abs(velocity[:, 0])
     held = np.array([np.median(size[level == one]) for one in level]) / size
     swept = dataclasses.replace(swept, velocity=velocity * held[:, None])
-    assert told.holds_response(swept, pictures[0])
+    assert told.is_response_controlled(swept, pictures[0])
     html = html_of(dataclasses.replace(drag[2], data=swept), pictures)
     assert "hold the response" in html
     forces = [one.force for one in pictures[0]]

@@ -48,5 +48,5 @@ def curved_curves():
     model = curved_beam()
     hz = 2 * np.pi
     curves = forced_response(model, CURVED_BEAM_FORCES[:2], 30 * hz, 110 * hz)
-    # The other curves come from rest and turn back at a superharmonic resonance.
+    # The other curves start from rest and fold back at a superharmonic resonance.
     return model, [curve for curve in curves if curve.status == CurveStatus.UPPER_END]

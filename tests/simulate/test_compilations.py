@@ -1,4 +1,4 @@
-"""Public verbs do not compile anew for other floating-point numbers."""
+"""Public functions do not recompile for other floating-point numbers."""
 
 import jax
 import numpy as np
@@ -60,7 +60,7 @@ VERBS = {
 def test_other_numbers_compile_nothing(verb, compilations):
     jax.clear_caches()  # of what other tests compiled
     VERBS[verb](0.0)
-    assert len(compilations) > 0  # and the count does count
+    assert len(compilations) > 0  # the counter works
     del compilations[:]
     VERBS[verb](1.0)
     VERBS[verb](2.0)

@@ -1,4 +1,4 @@
-"""Derivatives that are promised: forward and reverse agree, differences agree, failures spread not.
+"""Documented derivatives: forward, reverse and differences agree; failures do not spread.
 
 Every function of a batch has a member that cannot be solved: its value and its derivatives are NaN,
 and those of the others are what they are.
@@ -91,7 +91,7 @@ def assert_gradients(function, failed):
 
 
 def assert_second_derivatives(function):
-    """What is left out of a sum leaves its derivatives alone, of first and of second order."""
+    """Members left out of a sum do not affect its first and second derivatives."""
     zero, way = np.zeros(len(NAMES)), np.cos(1.0 + np.arange(len(NAMES)))
 
     @jax.jit
@@ -112,7 +112,7 @@ def assert_second_derivatives(function):
 def test_periodic_motion(curve):
     # The other conditions, without a member that fails: `solutions/test_periodic_motion.py`.
     coefficients, frequency = curve.point(int(curve.at_events("phase_resonance")[0]))
-    # A start that is not finite, between two that are: nothing is found from it.
+    # A start that is not finite between two that are: it does not converge.
     starts = np.stack([coefficients, np.full_like(coefficients, np.nan), 1.001 * coefficients])
 
     @jax.jit
@@ -127,7 +127,7 @@ def test_periodic_motion(curve):
     assert_gradients(motions, failed=[1])
     assert_second_derivatives(motions)
     found, _, real, imaginary = np.asarray(motions(np.zeros(len(NAMES))))[0]
-    # The curve's own event: located with tangents late by 1e-6.
+    # The curve's own event: located with tangents off by 1e-6.
     assert found == pytest.approx(frequency, rel=1e-6)
     lost = jax.jacfwd(jax.grad(lambda shifts: motions(shifts)[1, 0]))(np.zeros(len(NAMES)))
     assert np.isnan(lost).all()

@@ -1,4 +1,4 @@
-"""Every result of a simulation says itself on one screen, is labelled and is drawn."""
+"""Every result of a simulation prints on one screen, is labelled and can be plotted."""
 
 import dataclasses
 
@@ -31,7 +31,7 @@ def curve():
 # Near a peak at `FORCE`: coefficients and rad/s.
 PEAK = (np.array([0.0, 0.0, 1.0, 0.0, 0.0])[:, None], 2.22)
 SETTINGS = sj.simulate.ResponseSettings(harmonic_order=3, stability=False)
-# What computes a result, what its first line says, and a variable with its unit.
+# How a result is computed, its first printed line, and a variable with its unit.
 RESULTS = {
     "forced response": (
         lambda: sj.forced_response(oscillator(), [FORCE], *ENDS, harmonic_order=3)[0],
@@ -80,7 +80,7 @@ RESULTS = {
 
 
 @pytest.mark.parametrize("name", RESULTS)
-def test_results_say_themselves_and_are_drawn(name):
+def test_results_are_printed_and_drawn(name):
     compute, (first, variable, unit) = RESULTS[name]
     result = compute()
     lines = repr(result).splitlines()
@@ -95,7 +95,7 @@ def test_results_say_themselves_and_are_drawn(name):
     assert isinstance(result.plot(), Figure)
 
 
-def test_motions_say_what_was_not_found(curve):
+def test_motions_report_what_did_not_converge(curve):
     heights = jnp.array([0.2, 30.0]) * np.abs(curve.velocity[:, 1, 0]).max()
 
     def motion_at(height):
@@ -113,7 +113,7 @@ def test_motions_say_what_was_not_found(curve):
     assert isinstance(one.plot(), Figure)
 
 
-def test_tables_have_one_row_a_member():
+def test_tables_have_one_row_per_member():
     batch, (first, _, _) = RESULTS["batch"][0](), RESULTS["batch"][1]
     assert repr(batch).startswith(first)
     table = batch.to_pandas()
@@ -154,7 +154,7 @@ def test_stability_that_was_not_computed_is_neither_stable_nor_unstable(curve):
     assert np.sum(holed.stability == kind.NOT_COMPUTED) == 1
 
 
-def test_files_say_where_stability_was_not_computed(curve, tmp_path):
+def test_files_state_where_stability_was_not_computed(curve, tmp_path):
     multipliers = curve.multipliers.copy()
     multipliers[3] = np.nan
     fold = int(curve.at_events("fold")[0])

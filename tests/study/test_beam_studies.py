@@ -112,7 +112,7 @@ def test_a_member_without_a_model_is_a_row(linear_model, tmp_path):
 @pytest.mark.long
 def test_members_are_beams_of_their_own_and_one_that_is_none_is_a_row(folder):
     study = read(folder, STUDY + THICKNESS)
-    # Beside the two thicknesses an arch that the load cases push through, and a damping ratio.
+    # In addition to two thicknesses an arch that snaps through in the load cases, and a damping.
     varied = (
         sj.study.Discrete("section.thickness_m", [0.0004, 0.0004, 0.0005]),
         sj.study.Discrete("geometry.rise_m", [0.0, 0.2, 0.0]),
@@ -165,7 +165,7 @@ def test_a_study_of_a_beam_is_known_by_the_beam(folder):
         (THICKNESS.replace("section.thickness_m", "geometry.radius_m"), "vary geometry.rise_m"),
         (
             THICKNESS.replace("section.thickness_m", "supports.left.rotation_nm_rad"),
-            "it is held there; to vary its stiffness state one, such as left = { rotation_nm_rad",
+            "it is fixed there; to vary its stiffness state one, such as left = { rotation_nm_rad",
         ),
         (THICKNESS.replace("0.0005", "0.5"), "must be below the length (0.2286), but member 1"),
         (THICKNESS.replace("0.0005", "-0.5"), "section.thickness_m must be positive, but member 1"),

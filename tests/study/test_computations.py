@@ -93,7 +93,7 @@ def test_every_member_identifies_with_its_own_model(linear_model, tmp_path):
     )
     varied = (sj.study.Discrete("mode_1.participation", [PARTICIPATION, 1.1 * PARTICIPATION]),)
     found = computed(linear_model, sj.study.Identifications(data), varied, tmp_path)
-    # Exact states on both sides of resonance tell the modal mass, and with it the damping that
+    # Exact states on both sides of resonance determine the modal mass, and with it the damping that
     # made them, however wrong the member's is.
     np.testing.assert_allclose(found.damping_ratio, 0.02, rtol=1e-3)
     assert found.n_solved.values.tolist() == [18, 18]
@@ -107,13 +107,13 @@ def test_bounds_on_a_grid_are_those_of_the_curve(linear_model, tmp_path):
     omega = HERTZ * data.frequency_hz.values
     linear = omega * 0.5 * SHAPE * PARTICIPATION
     linear /= np.abs(OMEGA**2 - omega**2 + 2j * 0.02 * OMEGA * omega)
-    # Straight lines between points of a curve whose steps turn by less than 0.1 rad.
+    # Straight lines between points of a curve whose steps rotate by less than 0.1 rad.
     np.testing.assert_allclose(data.upper_velocity_m_s[0], linear, rtol=0.01)
     np.testing.assert_array_equal(data.upper_velocity_m_s, data.lower_velocity_m_s)
 
 
 def test_bounds_of_a_folded_curve_are_its_outer_branches():
-    """A curve that turns back twice: between its folds three velocities, of which two count."""
+    """A curve with two folds: between them three velocities, of which two count."""
 
     class Folded:
         frequency = np.array([1.0, 3.0, 2.0, 4.0])
@@ -125,7 +125,7 @@ def test_bounds_of_a_folded_curve_are_its_outer_branches():
     np.testing.assert_allclose(low, [np.nan, 1.0, 1.5, 0.5, 0.0])
 
 
-def test_a_member_that_cannot_be_computed_says_why_and_the_others_are_untouched(
+def test_a_member_that_cannot_be_computed_gives_a_reason_and_the_others_are_untouched(
     linear_model, tmp_path
 ):
     within = sj.study.ResponseRange(0.9 * OMEGA, 1.1 * OMEGA, harmonic_order=1)
@@ -150,7 +150,7 @@ def test_a_range_without_the_resonance_has_a_status_of_its_own(linear_model, tmp
     found = digest(data)
     assert data.peak_side.values.tolist() == [0, -1, 1]
     assert found.failures.n_failed == 2
-    ended = "3 members, of which 2 have no whole result: 2 no_peak_in_range."
+    ended = "3 members, of which 2 have no complete result: 2 no_peak_in_range."
     assert members_ended(found) == ended
     assert Fact("no_peak_in_range", n_members=2, below=1, above=1) in found.facts
     row = next(s for s in found.summaries if s.scalar.name == "peak_frequency_hz")
@@ -158,8 +158,8 @@ def test_a_range_without_the_resonance_has_a_status_of_its_own(linear_model, tmp
     assert row.quantiles[[0, 2, 4]].tolist() == [-np.inf, data.peak_frequency_hz[0], np.inf]
 
 
-def test_a_response_that_is_highest_where_no_peak_was_located_has_no_peak(linear_model):
-    """Its peak forgotten, a resonance curve is highest at an unnamed point all the same."""
+def test_a_largest_point_that_is_not_a_located_peak_is_not_reported_as_peak(linear_model):
+    """A resonance curve whose peak event was removed: its largest point is not a located peak."""
     (whole,) = sj.forced_response(linear_model, 0.5, 0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1)
     assert peak_status([whole], "upper_end") == "upper_end"
     events = tuple("" if kind == "peak" else kind for kind in whole.event)
@@ -172,7 +172,7 @@ def test_a_response_that_is_highest_where_no_peak_was_located_has_no_peak(linear
 
 
 def test_a_peak_below_the_response_at_the_end_of_the_range_is_not_the_highest(tmp_path):
-    """A weak mode in the range beside a strong one above it, whose flank is higher."""
+    """A weak mode in the range below a strong one, whose flank is higher."""
     modes = sj.model.linear_modes([OMEGA, 1.25 * OMEGA], [0.01, 0.01], [[1.0, 1.0]], [0.1, 3.0])
     omega = OMEGA * np.array([1.0, 1.2])
     own = np.array([[OMEGA], [1.25 * OMEGA]])

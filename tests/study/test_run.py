@@ -1,4 +1,4 @@
-"""Runs of whole studies in this process: what is computed, kept, refused and mended."""
+"""Runs of whole studies in this process: what is computed, kept, refused and repaired."""
 
 import os
 import shutil
@@ -224,7 +224,7 @@ def test_a_disk_that_is_full_costs_nothing_that_is_done(study_of_module, finishe
             raise OSError(28, "No space left on device")
 
     out = tmp_path / finished.name
-    with pytest.raises(ValueError, match=r"No space left on device\. What is done stays"):
+    with pytest.raises(ValueError, match=r"No space left on device\. Completed chunks are kept"):
         run_here(study_of_module, out, InThisProcess(before))
     workers = InThisProcess()
     run_here(study_of_module, out, workers)
@@ -233,7 +233,7 @@ def test_a_disk_that_is_full_costs_nothing_that_is_done(study_of_module, finishe
 
 
 def test_a_worker_ends_with_the_process_that_started_it():
-    # Without anybody who would tell it its core: the queue is empty for ever.
+    # No core is assigned: the queue stays empty.
     code = "import queue; from snrmjax.study.execution import settle; settle(2**30, queue.Queue())"
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 1
 
@@ -335,7 +335,7 @@ def linear_peak(model, sensor, force):
     return found.x / (2 * np.pi), -found.fun
 
 
-def test_a_study_tells_of_the_sensor_that_it_is_asked_for(two_sensors, tmp_path):
+def test_a_study_has_the_outputs_of_its_sensor(two_sensors, tmp_path):
     within = sj.study.ResponseRange(0.8 * OMEGA, 1.4 * OMEGA, harmonic_order=1, stability=False)
     varied = (sj.study.Discrete("mode_1.damping_ratio", [0.02]),)
 
@@ -351,8 +351,8 @@ def test_a_study_tells_of_the_sensor_that_it_is_asked_for(two_sensors, tmp_path)
         np.testing.assert_allclose(data.peak_velocity_m_s, velocity, rtol=1e-9)
         np.testing.assert_allclose(data.peak_frequency_hz, hertz, rtol=1e-6)
         assert data.attrs["sensor"] == sensor
-        said = data.peak_velocity_m_s.attrs["long_name"]
-        assert said == f"velocity at the highest peak, at {sensor}"
+        long_name = data.peak_velocity_m_s.attrs["long_name"]
+        assert long_name == f"velocity at the highest peak, at {sensor}"
     # A study that names no sensor, as one begun before, is that of the first.
     again = InThisProcess()
     run_here(study(None), tmp_path / "a.zarr", again)
@@ -363,10 +363,10 @@ def test_a_study_tells_of_the_sensor_that_it_is_asked_for(two_sensors, tmp_path)
         study("c").ensemble()
 
 
-def test_what_identifies_a_test_tells_of_the_sensor_that_moves_most(two_sensors):
+def test_virtual_tests_use_the_sensor_that_moves_most(two_sensors):
     within = sj.study.ResponseRange(0.8 * OMEGA, 1.1 * OMEGA)
     tests = sj.study.VirtualTests(within, np.array([0.5]))
     varied = (sj.study.Discrete("mode_1.damping_ratio", [0.02]),)
     assert sj.study.Study("test", two_sensors, tests, varied).sensor_told == "a"
-    with pytest.raises(ValueError, match="virtual_test tells of a, where the mode of interest"):
+    with pytest.raises(ValueError, match="virtual_test uses a, where the mode of interest"):
         sj.study.Study("test", two_sensors, tests, varied, sensor="b").ensemble()

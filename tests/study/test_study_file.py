@@ -1,4 +1,4 @@
-"""Study files: what they say, and what is refused with one sentence and nothing left behind."""
+"""Study files: their content, and refusals with one sentence and no output."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def written(folder, text):
     return path
 
 
-def test_a_study_file_says_what_the_object_has(folder):
+def test_a_study_file_gives_the_study(folder):
     text = HEAD + "sensor = 'tip'\nharmonics = 3\ngrid_points = 11\nmembers_a_chunk = 5\n" + VARY
     text += '[[vary]]\nparameter = "coulomb_friction.force"\ndistribution = "lognormal"\n'
     text += "mean = 0.02\nstd = 0.01\n" + SAMPLE
@@ -151,8 +151,8 @@ def test_a_bad_study_is_refused_before_anything_is_written(
     monkeypatch.setattr("sys.argv", command)
     with pytest.raises(SystemExit) as ended:
         main()
-    said = capsys.readouterr().err
+    printed = capsys.readouterr().err
     assert ended.value.code == 2
-    assert words in said
-    assert said.partition("read more: ")[0].count("\n") == 1
+    assert words in printed
+    assert printed.partition("read more: ")[0].count("\n") == 1
     assert {p.name for p in folder.iterdir()} == before

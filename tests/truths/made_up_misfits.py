@@ -39,7 +39,7 @@ def misfit_of(order=None, shared=None, phase_unknown=False):
         noise=noise_of(np.tile(np.eye(2), (N_STATES, 1, 1)), shared),
         predictions=SimpleNamespace(
             chosen=chosen,
-            level_sizes=(0.0,) * 4,
+            level_error_std=(0.0,) * 4,
             unstated_levels=(False,) * 4,
             error_scale=1.0,
         ),

@@ -1,1 +1,1 @@
-"""Built-in finite elements: beams and arches in a plane, with large displacements and rotations."""
+"""Built-in finite elements: plane beams and arches with large displacements and rotations."""

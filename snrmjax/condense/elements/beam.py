@@ -1,4 +1,4 @@
-"""A beam or arch by its dimensions, and the geometry of its elements."""
+"""A beam or arch: dimensions, supports and mesh geometry."""
 
 from typing import Literal, NamedTuple
 
@@ -27,7 +27,7 @@ def _stiffness(value: Number | None) -> Float[Array, ""] | None:
 
 
 def _check(part: eqx.Module, rule: Rule, *names: str) -> None:
-    """Raises `ValueError` for a number that breaks the rule, where it has a value."""
+    """Raises `ValueError` for a concrete number that breaks the rule."""
     for name in names:
         value = getattr(part, name)
         if value is None or not have_values(value):
@@ -39,10 +39,10 @@ def _check(part: eqx.Module, rule: Rule, *names: str) -> None:
 
 
 class Support(eqx.Module):
-    """Springs between an end and the ground: None (or infinite) is held, zero is free.
+    """Springs between an end and the ground: None (or infinite) is fixed, zero is free.
 
     `axial` acts along the chord of the beam and `transverse` across it, both in N/m; `rotation`
-    in N m/rad. Derivatives by a stiffness are those of a finite one.
+    in N m/rad. A fixed direction has no derivative by its stiffness.
     """
 
     axial: Number | None = eqx.field(converter=_stiffness, default=None)
@@ -75,14 +75,14 @@ def _support(value: Support | SupportName) -> Support:
 
 
 class PointMass(eqx.Module):
-    """A mass (kg) fixed to the beam at a fraction of its length, with its rotary inertia."""
+    """A mass (kg) attached to the beam at a fraction of its length, with its rotary inertia."""
 
     at: float = eqx.field(static=True)
     mass: Number = eqx.field(converter=_number)
     inertia: Number = eqx.field(converter=_number, default=0.0)  # kg m²
 
     def __check_init__(self) -> None:
-        """Raises `ValueError` for a place off the beam or a negative mass."""
+        """Raises `ValueError` for a position off the beam or a negative mass."""
         if not 0 <= self.at <= 1:
             raise ValueError(f"`at` must be a fraction of the length, but is {self.at:g}.")
         _check(self, NOT_NEGATIVE, "mass", "inertia")
@@ -94,7 +94,7 @@ class Beam(eqx.Module):
     `length` is that of the chord and `rise` the height of the arc over it (`rise_of_radius` gives
     it from a radius); the arc is stress-free. x runs along the chord, y away from the centre of
     curvature. `poisson` None: no shear deformation; else it is that of a rectangular section.
-    All numbers but `elements` may be differentiated by; SI units throughout.
+    Differentiable by all numbers but `elements`; SI units throughout.
 
     >>> Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0).nodes.shape
     (41, 2)
@@ -117,7 +117,7 @@ class Beam(eqx.Module):
     point_masses: tuple[PointMass, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
 
     def __check_init__(self) -> None:
-        """Raises `ValueError` for numbers that no beam has and for supports that hold nothing."""
+        """Raises `ValueError` for invalid dimensions."""
         if isinstance(self.elements, bool) or not isinstance(self.elements, int):
             raise ValueError(f"`elements` must be a whole number, but is {self.elements!r}.")
         if self.elements < 2:
@@ -145,7 +145,7 @@ class Beam(eqx.Module):
         def sinc(angle: Array) -> Array:
             return jnp.sinc(angle / jnp.pi)
 
-        # R sin and R (cos − cos) without a radius, which a straight beam has not.
+        # R sin and R (cos − cos) without the radius, which is infinite for a straight beam.
         x = 0.5 * self.length * (1 + t * sinc(t * half) / sinc(half))
         bulge = sinc(0.5 * half * (1 + t)) * sinc(0.5 * half * (1 - t)) / sinc(half)
         return jnp.stack([x, 0.25 * self.length * half * (1 - t**2) * bulge], axis=1)
@@ -157,18 +157,18 @@ class Beam(eqx.Module):
 
     @property
     def free(self) -> np.ndarray:
-        """Which of the degrees of freedom (x, y, rotation of each node in turn) are not held."""
-        held = [
+        """The unconstrained degrees of freedom (x, y, rotation of each node in turn)."""
+        fixed = [
             3 * node + k
             for node, end in self.ends
             for k, spring in enumerate(end.springs)
             if spring is None
         ]
-        return np.setdiff1d(np.arange(self.n_dof), held)
+        return np.setdiff1d(np.arange(self.n_dof), fixed)
 
     @property
     def n_dof(self) -> int:
-        """Number of degrees of freedom, held ones included."""
+        """Number of degrees of freedom, fixed ones included."""
         return 3 * (self.elements + 1)
 
 

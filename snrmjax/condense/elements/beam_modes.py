@@ -1,4 +1,4 @@
-"""Linear modes of a beam, and what forces and sensors see of them."""
+"""Linear modes of a beam, their shapes at sensors and participation of forces."""
 
 from collections.abc import Sequence
 
@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 
 from snrmjax.condense.elements.beam import Beam
 from snrmjax.condense.elements.strain_energy import (
+    interpolation,
     mass_matrix,
-    shape_rows,
     tangent_stiffness,
     uniform_load,
 )
@@ -18,22 +18,21 @@ from snrmjax.condense.load_cases import ReductionBasis
 from snrmjax.model.modes import have_values
 from snrmjax.numerics.compiled import compiled
 
-_MIDSPAN_NODE = 0.05  # of the largest displacement: below it midspan does not choose the sign
+_MIDSPAN_NODE = 0.05  # of the largest displacement, below which midspan counts as a node
 _MECHANISM = 1e-10  # of the largest squared frequency a beam of so many elements could have
 
 
 def beam_modes(beam: Beam, modes: Sequence[int]) -> ReductionBasis:
     """Mass-normalised modes of small vibration about the stress-free shape: K φ = ω² M φ.
 
-    Shapes have rows for all degrees of freedom (x, y, rotation of each node, zero where held).
-    Their sign is positive upwards at midspan; where that is a node, at the first place from the
-    left that moves almost as far as any. Frequencies and shapes are differentiable by everything
-    in `beam` (first and second derivatives), where their frequency differs from that of all other
-    modes.
+    Shapes have rows for all degrees of freedom (x, y, rotation of each node, zero where fixed).
+    Their sign is positive upwards at midspan; if that is a node, at the first point from the left
+    with at least 0.9 of the maximum. Frequencies and shapes are differentiable by everything in
+    `beam` (first and second derivatives), for distinct natural frequencies.
 
     Arguments: `modes` numbers counted from one, in order of frequency (axial modes counted too).
-    Raises `ValueError` for modes that the elements do not have or that are too coarsely resolved
-    (above one for each element), and for supports that leave a mechanism.
+    Raises `ValueError` for modes above one per element, which the mesh does not resolve, and for
+    supports that leave a mechanism.
 
     >>> beam = Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0)
     >>> (beam_modes(beam, (1, 3)).frequency / (2 * np.pi)).round(2)
@@ -56,12 +55,12 @@ def beam_modes(beam: Beam, modes: Sequence[int]) -> ReductionBasis:
 @compiled
 def _linear_modes(beam: Beam, numbers: tuple[int, ...]) -> ReductionBasis:
     free = beam.free
-    places = free[:, None], free
+    block = free[:, None], free
     whole_mass = mass_matrix(beam)
-    stiffness = tangent_stiffness(beam, jnp.zeros(beam.n_dof))[places]
-    mass = whole_mass[places]
+    stiffness = tangent_stiffness(beam, jnp.zeros(beam.n_dof))[block]
+    mass = whole_mass[block]
     k, m = jax.lax.stop_gradient((stiffness, mass))
-    # Of K⁻¹M, whose largest eigenvalues are the lowest modes: they keep all their digits.
+    # Eigenvalues of K⁻¹M: the lowest modes are the largest and keep all digits.
     scale = 1 / jnp.sqrt(jnp.diagonal(k))
     root = jnp.linalg.cholesky(k * scale[:, None] * scale)
     half = jax.scipy.linalg.solve_triangular(root, m * scale[:, None] * scale, lower=True)
@@ -73,18 +72,18 @@ def _linear_modes(beam: Beam, numbers: tuple[int, ...]) -> ReductionBasis:
     shapes = shapes * _sign(beam, shapes) / jnp.sqrt(values[chosen])
 
     def differentiable(value: Array, shape: Array) -> tuple[Array, Array]:
-        # Newton steps on K φ = λ M φ, φᵀMφ = 1, with a fixed matrix (Nelson's, with the shape's own
-        # direction made regular): nothing but rounding in value, and each makes one more order of
-        # derivatives whole.
+        # Newton steps on K φ = λ M φ, φᵀMφ = 1, with a fixed matrix (Nelson's, regularised along
+        # the shape): the value changes by rounding only, and each step makes one more order of
+        # derivatives exact.
         weighted = m @ shape
         regular = k - m / value + jnp.outer(weighted, weighted) / value
         factor = jax.scipy.linalg.lu_factor(regular)
         for _ in range(2):
-            size = shape @ mass @ shape
-            squared = shape @ stiffness @ shape / size
+            modal_mass = shape @ mass @ shape
+            squared = shape @ stiffness @ shape / modal_mass
             residual = stiffness @ shape - squared * (mass @ shape)
             change = jax.scipy.linalg.lu_solve(factor, residual)
-            shape = shape - change - 0.5 * shape * (size - 1)
+            shape = shape - change - 0.5 * shape * (modal_mass - 1)
         return squared, shape
 
     squared, shapes = jax.vmap(differentiable, (0, 1), (0, 1))(values[chosen], shapes)
@@ -102,7 +101,7 @@ def _linear_modes(beam: Beam, numbers: tuple[int, ...]) -> ReductionBasis:
 def _sign(beam: Beam, shapes: Float[Array, "free mode"]) -> Float[Array, " mode"]:
     whole = jnp.zeros((beam.n_dof, shapes.shape[1])).at[beam.free].set(shapes)
     up = whole[1::3]
-    midspan = jax.lax.stop_gradient(shape_rows(beam, 0.5)[1]) @ whole
+    midspan = jax.lax.stop_gradient(interpolation(beam, 0.5)[1]) @ whole
     largest = jnp.max(jnp.abs(up), axis=0)
     first = jnp.argmax(jnp.abs(up) >= 0.9 * largest, axis=0)
     at_first = jnp.take_along_axis(up, first[None], axis=0)[0]
@@ -111,18 +110,18 @@ def _sign(beam: Beam, shapes: Float[Array, "free mode"]) -> Float[Array, " mode"
 
 
 def shape_at(beam: Beam, basis: ReductionBasis, fraction: float) -> Float[Array, " mode"]:
-    """Mode shapes across the chord at a fraction of the length, kg^-1/2: a sensor's row."""
+    """Transverse mode shapes at a fraction of the length, kg^-1/2, as for a sensor."""
     _check_fraction(fraction)
-    return shape_rows(beam, fraction)[1] @ basis.shapes
+    return interpolation(beam, fraction)[1] @ basis.shapes
 
 
 def participation(
     beam: Beam, basis: ReductionBasis, at: float | None = None
 ) -> Float[Array, " mode"]:
-    """Φᵀb of a force across the chord, per newton in total, kg^-1/2.
+    """Φᵀb of a transverse force, per newton in total, kg^-1/2.
 
-    Arguments: `at` is the fraction of the length where the force acts; None: it is spread evenly
-    along the beam.
+    Arguments: `at` is the fraction of the length where the force acts; None: uniform along the
+    beam.
     """
     if at is None:
         return uniform_load(beam) @ basis.shapes
@@ -131,4 +130,4 @@ def participation(
 
 def _check_fraction(fraction: float) -> None:
     if not 0 <= fraction <= 1:
-        raise ValueError(f"a place must be a fraction of the length, but is {fraction:g}.")
+        raise ValueError(f"a position must be a fraction of the length, but is {fraction:g}.")

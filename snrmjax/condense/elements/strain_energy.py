@@ -1,14 +1,14 @@
 """Strain energy, forces, tangent stiffness and mass of a chain of plane beam elements.
 
-Each element keeps its deformation in a frame that turns with its chord (corotational), where it is
-a shallow arch: cubic deflection w with the end slopes a and b, and *one* membrane strain, the mean
-over the element,
+The deformation of each element is described in a frame that rotates with its chord (corotational),
+where it is a shallow arch: cubic deflection w with the end slopes a and b, and *one* membrane
+strain, the mean over the element,
 
     e = (l − l₀)/s + mean of w'²/2 − mean of w₀'²/2,    mean of w'²/2 = (2a² − ab + 2b²)/30.
 
 With the linear strain of the chord alone an element of a strongly bent beam is too long by θ²/24;
-with w'²/2 point by point, which cubic and linear functions cannot balance, bending stretches
-(membrane locking). The mean does neither. Rotations of the whole are exact, strains are small.
+a pointwise w'²/2, which cubic and linear functions cannot balance, causes membrane locking. The
+mean avoids both. Rigid-body rotations are exact, strains are small.
 
 References: M. A. Crisfield, Non-linear Finite Element Analysis of Solids and Structures, vol. 1
 (Wiley 1991), ch. 7 (corotational and shallow-arch elements); shear as in J. S. Przemieniecki,
@@ -24,23 +24,23 @@ from snrmjax.condense.elements.beam import Beam, section_of
 
 
 def strain_energy(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array, ""]:
-    """Energy (J) of elements and support springs, at displacements of all degrees of freedom.
+    """Energy (J) of elements and support springs, for displacements of all degrees of freedom.
 
-    The displacement of each node in turn: x, y (m), rotation (rad), from the stress-free shape.
+    Displacements of each node in turn: x, y (m), rotation (rad), from the stress-free shape.
     """
     inside = jax.vmap(_element_energy, (None, 0, 0))(beam, _chords(beam), _relative(displacement))
     return jnp.sum(inside) + 0.5 * jnp.sum(_springs(beam) * displacement**2)
 
 
 def internal_force(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array, " dof"]:
-    """Derivative of the strain energy: N and N m, in order of the degrees of freedom."""
+    """Gradient of the strain energy: N and N m, in order of the degrees of freedom."""
     moved = _relative(displacement)
     forces = jax.vmap(jax.grad(_element_energy, 2), (None, 0, 0))(beam, _chords(beam), moved)
     return _gathered(forces @ _RELATIVE) + _springs(beam) * displacement
 
 
 def tangent_stiffness(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
-    """Second derivative of the strain energy."""
+    """Hessian of the strain energy."""
     moved = _relative(displacement)
     blocks = jax.vmap(jax.hessian(_element_energy, 2), (None, 0, 0))(beam, _chords(beam), moved)
     return _assembled(_RELATIVE.T @ blocks @ _RELATIVE) + jnp.diag(_springs(beam))
@@ -52,22 +52,22 @@ def mass_matrix(beam: Beam) -> Float[Array, "dof dof"]:
     s, section = beam.arc_length / n, section_of(beam)
     along = jnp.array([[2.0, 1.0], [1.0, 2.0]]) * section.mass * s / 6
     across = _CUBIC_MASS * section.mass * s + _CUBIC_SLOPE * section.rotary / s
-    size = jnp.array([1.0, s, 1.0, s])
-    across = across * size[:, None] * size
+    unit = jnp.array([1.0, s, 1.0, s])
+    across = across * unit[:, None] * unit
     local = jnp.zeros((6, 6))
     local = local.at[np.ix_([0, 3], [0, 3])].set(along)
     local = local.at[np.ix_([1, 2, 4, 5], [1, 2, 4, 5])].set(across)
-    turned = _turned(beam)
-    mass = _assembled(jnp.einsum("eki,kl,elj->eij", turned, local, turned))
+    rotation = _rotations(beam)
+    mass = _assembled(jnp.einsum("eki,kl,elj->eij", rotation, local, rotation))
     for point in beam.point_masses:
-        rows = shape_rows(beam, point.at)
+        rows = interpolation(beam, point.at)
         weight = jnp.stack([point.mass, point.mass, point.inertia])
         mass = mass + jnp.einsum("ki,k,kj->ij", rows, weight, rows)
     return mass
 
 
-def shape_rows(beam: Beam, fraction: float) -> Float[Array, "3 dof"]:
-    """Rows that give x, y (m) and rotation (rad) at a fraction of the length from all freedoms."""
+def interpolation(beam: Beam, fraction: float) -> Float[Array, "3 dof"]:
+    """Matrix that interpolates x, y (m) and rotation (rad) at a fraction of the length."""
     n = beam.elements
     element = min(int(fraction * n), n - 1)
     t, s = fraction * n - element, beam.arc_length / n
@@ -87,22 +87,22 @@ def shape_rows(beam: Beam, fraction: float) -> Float[Array, "3 dof"]:
     )
     rows = rows.at[1, jnp.array([[1, 4], [2, 5]])].set(cubic)
     rows = rows.at[2, jnp.array([[1, 4], [2, 5]])].set(slope)
-    turned = _turned(beam)[element]
-    rows = turned[:3, :3].T @ rows @ turned
+    rotation = _rotations(beam)[element]
+    rows = rotation[:3, :3].T @ rows @ rotation
     return jnp.zeros((3, beam.n_dof)).at[:, _connectivity(n)[element]].set(rows)
 
 
 def uniform_load(beam: Beam) -> Float[Array, " dof"]:
-    """Consistent nodal forces of one newton across the chord, spread evenly along the beam."""
-    n, turned = beam.elements, _turned(beam)
-    # Of each element's share, along and across its own chord; moments ± p s²/12.
-    along, across = 0.5 * turned[:, 0, 1], 0.5 * turned[:, 0, 0]
+    """Consistent nodal forces of a uniform transverse load of one newton in total."""
+    n, rotation = beam.elements, _rotations(beam)
+    # Load of each element along and across its own chord; moments ± p s²/12.
+    along, across = 0.5 * rotation[:, 0, 1], 0.5 * rotation[:, 0, 0]
     moment = across * beam.arc_length / (6 * n)
     local = jnp.stack([along, across, moment, along, across, -moment], axis=1) / n
-    return _gathered(jnp.einsum("ek,ekj->ej", local, turned))
+    return _gathered(jnp.einsum("ek,ekj->ej", local, rotation))
 
 
-# What deforms an element: difference of displacements, mean and half difference of rotations.
+# Deformation of an element: differences of displacements, mean and half difference of rotations.
 _RELATIVE = np.array(
     [
         [-1.0, 0, 0, 1, 0, 0],
@@ -140,14 +140,14 @@ def _springs(beam: Beam) -> Float[Array, " dof"]:
     return springs
 
 
-def _turned(beam: Beam) -> Float[Array, "element 6 6"]:
+def _rotations(beam: Beam) -> Float[Array, "element 6 6"]:
     """Rotation from x and y to along and across each chord, for both ends."""
     chord = _chords(beam)
     c, s = (chord / jnp.linalg.norm(chord, axis=1, keepdims=True)).T
     zero, one = jnp.zeros_like(c), jnp.ones_like(c)
     block = jnp.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
-    turned = jnp.zeros((len(c), 6, 6))
-    return turned.at[:, :3, :3].set(block).at[:, 3:, 3:].set(block)
+    rotation = jnp.zeros((len(c), 6, 6))
+    return rotation.at[:, :3, :3].set(block).at[:, 3:, 3:].set(block)
 
 
 def _relative(displacement: Float[Array, " dof"]) -> Float[Array, "element 4"]:
@@ -163,16 +163,18 @@ def _element_energy(
     squared = jnp.sum(chord**2)
     ahead = jnp.sum(chord * moved)
     aside = chord[0] * moved[1] - chord[1] * moved[0]
-    # Differences are formed before squares and roots: small motions keep all their digits.
+    # Differences are formed before squares and roots, so that small motions keep all digits.
     before = jnp.sqrt(squared)
     now = jnp.sqrt(jnp.sum((chord + moved) ** 2))
     longer = (2 * ahead + jnp.sum(moved**2)) / (now + before)
-    # The chord against the mean rotation of the ends, an angle below a half turn however far the
-    # beam has turned.
-    turn, difference = relative[2], relative[3]
-    c, d = jnp.cos(turn), jnp.sin(turn)
-    chord_turn = jnp.arctan2(c * aside - d * (squared + ahead), c * (squared + ahead) + d * aside)
-    a, b = difference - chord_turn, -difference - chord_turn
+    # The chord relative to the mean rotation of the ends, an angle below half a revolution for any
+    # rotation of the beam.
+    mean_rotation, difference = relative[2], relative[3]
+    c, d = jnp.cos(mean_rotation), jnp.sin(mean_rotation)
+    chord_rotation = jnp.arctan2(
+        c * aside - d * (squared + ahead), c * (squared + ahead) + d * aside
+    )
+    a, b = difference - chord_rotation, -difference - chord_rotation
     mean = 2 * a * (a + 2 * initial) + 2 * b * (b - 2 * initial) - (a * b + initial * (b - a))
     strain = longer / s + mean / 30
     phi = 0.0 if section.shear is None else 12 * section.bending / (section.shear * s**2)

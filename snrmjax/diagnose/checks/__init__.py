@@ -1,1 +1,1 @@
-"""Checks of an answer: patterns in the residuals, cross-validation, doubts, the verdict."""
+"""Checks of an answer: residual noise, cross-validation on levels, gains."""

@@ -1,4 +1,4 @@
-"""What an answer leaves: levels that were left out of its fit, patterns, and the size of noise."""
+"""Residuals of an answer: cross-validation on withheld levels, and the noise level."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -15,29 +15,29 @@ from snrmjax.diagnose.misfit.noise_model import (
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 
-class HeldOut(NamedTuple):
+class WithheldLevel(NamedTuple):
     """Root-mean-square misfit of one level in units of its predicted scatter."""
 
     level: int
     before: float
     after: float
-    p_value: float  # of `after`, by noise alone
+    p_value: float  # of `after`, for noise alone
 
 
-def held_out(
+def withheld_level(
     misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, level: int, noise: float = 1.0
-) -> HeldOut:
-    """Fit to the other levels alone, and compare with the one left out.
+) -> WithheldLevel:
+    """Fit to the other levels alone, and compare with the withheld one.
 
-    The misfit is that of the level given the others: errors that it shares with them through the
-    baseline's stated uncertainty are predicted too; its own gain and phase are not. `noise` is
-    the variance over the stated one for which probabilities are given.
+    The misfit is conditional on the other levels: errors that it shares with them through the
+    baseline's stated uncertainty are predicted; its own gain and phase are not. `noise` is the
+    noise variance over the stated one, for the p-value.
     """
-    out = rows_of_level(misfit, level)
-    given, n = misfit.noise.covariance.given_rows(~out), int(out.sum())
-    left = [given.decorrelated(_refitted(misfit, one, ~out)[1]) for one in (baseline, fit)]
+    withheld = rows_of_level(misfit, level)
+    given, n = misfit.noise.covariance.given_rows(~withheld), int(withheld.sum())
+    left = [given.decorrelated(_refitted(misfit, one, ~withheld)[1]) for one in (baseline, fit)]
     before, after = (float(rows @ rows) for rows in left)
-    return HeldOut(
+    return WithheldLevel(
         int(misfit.level_numbers[level]),
         float(np.sqrt(before / n)),
         float(np.sqrt(after / n)),
@@ -45,17 +45,17 @@ def held_out(
     )
 
 
-class HeldOutLevels(NamedTuple):
+class WithheldLevels(NamedTuple):
     """A level between others, and the top one."""
 
-    inner: HeldOut
-    outer: HeldOut
+    inner: WithheldLevel
+    outer: WithheldLevel
 
 
-def held_out_places(misfit: WeightedMisfit) -> tuple[int, ...]:
-    """Which levels are left out: that in the middle and the top one by velocity.
+def withheld_level_indices(misfit: WeightedMisfit) -> tuple[int, ...]:
+    """Indices of the levels to withhold: the middle and the top one by velocity.
 
-    None for fewer than three levels.
+    Empty for fewer than three levels.
     """
     chosen = misfit.predictions.chosen
     if chosen.n_levels < 3:
@@ -66,18 +66,20 @@ def held_out_places(misfit: WeightedMisfit) -> tuple[int, ...]:
     return int(order[chosen.n_levels // 2]), int(order[-1])
 
 
-def held_out_levels(
+def withheld_levels(
     misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, noise: float = 1.0
-) -> HeldOutLevels | None:
+) -> WithheldLevels | None:
     """Cross-validation on the level in the middle and the top one; None below three levels."""
-    found = [held_out(misfit, baseline, fit, k, noise) for k in held_out_places(misfit)]
-    return HeldOutLevels(*found) if found else None
+    levels = [
+        withheld_level(misfit, baseline, fit, k, noise) for k in withheld_level_indices(misfit)
+    ]
+    return WithheldLevels(*levels) if levels else None
 
 
 def without_level(
     misfit: WeightedMisfit, fit: EffectFit, level: int
 ) -> tuple[Float[np.ndarray, " parameter"], dict[str, float]]:
-    """A fit's parameters, and the baseline's: one step to the best fit without a level's rows."""
+    """A fit's parameters, and the baseline's, after one refit step without a level's rows."""
     kept = ~rows_of_level(misfit, level)
     change, rows = _refitted(misfit, fit, kept)
     values = np.clip(fit.values + change, fit.lower, fit.upper)
@@ -90,7 +92,7 @@ def rms_misfit(misfit: WeightedMisfit, fit: EffectFit) -> float:
 
 
 def rows_of_level(misfit: WeightedMisfit, level: int) -> Bool[np.ndarray, " row"]:
-    """Which rows are those of a level, by its place."""
+    """Mask of the rows of a level, by its index."""
     levels = np.asarray(misfit.predictions.chosen.states.level)
     return np.asarray(levels[misfit.noise.state] == level)
 
@@ -98,16 +100,14 @@ def rows_of_level(misfit: WeightedMisfit, level: int) -> Bool[np.ndarray, " row"
 def _refitted(
     misfit: WeightedMisfit, fit: EffectFit, kept: Bool[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " row"]]:
-    """The refit of a fit's parameters to some rows, to first order: their change, and all rows
-    after it.
-    """
-    scaled, size = unit_columns(fit.slopes)
+    """Refit to some rows, to first order: the change of the parameters, and all rows after it."""
+    scaled, norm = unit_columns(fit.slopes)
     both = misfit.noise.decorrelated(np.column_stack([scaled, fit.rows]).T, kept)
     sensitivities, left = both[:-1].T, both[-1]
     change = -np.linalg.pinv(sensitivities.T @ sensitivities, rcond=1e-12) @ (
         sensitivities.T @ left
     )
-    return change / size, fit.rows + scaled @ change
+    return change / norm, fit.rows + scaled @ change
 
 
 def along(
@@ -116,7 +116,7 @@ def along(
     """Rows of the force, level by level, along the resonance or in the order of the test.
 
     Along the resonance states are ordered by the phase of the velocity, which is monotonic even
-    where a resonance bends over.
+    on a folded resonance curve.
     """
     noise, chosen = misfit.noise, misfit.predictions.chosen
     level = np.asarray(chosen.states.level)
@@ -131,29 +131,31 @@ def along(
 
 
 def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> float:
-    """Variance of the force's misfit, over the stated one, by second differences along levels.
+    """Variance of the force misfit over the stated one, from second differences along levels.
 
-    What varies smoothly from state to state, explained or not, does not enter; errors that states
-    share are taken out first. Where phases are those of the fit, which may be wrong, the order of
-    the test counts too: noise is smooth in neither.
+    Smooth variation from state to state, explained or not, cancels; shared errors are removed
+    first. Where phases come from the fit, which may be wrong, the states are also taken in the
+    order of the test and the smaller variance counts: noise is rough in both orders.
     """
     left = misfit.noise.without_shared(fit.rows)
-    found = []
+    variances = []
     for of_test in (False, True) if misfit.predictions.chosen.phase_unknown.any() else (False,):
         parts = [some for some in along(misfit, left, of_test=of_test) if len(some) > 2]
         if not parts:
             return 1.0
         squares = [(some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6 for some in parts]
         differences = np.concatenate(squares)
-        # Jumps and kinks are not noise: beyond four times the median's 1σ they are cut off.
-        found.append(float(np.mean(np.minimum(differences, 16 * np.median(differences) / 0.4549))))
-    return min(found)
+        # Jumps are not noise: squares are clipped at (4σ)², σ² = median/0.4549 (median of χ²₁).
+        variances.append(
+            float(np.mean(np.minimum(differences, 16 * np.median(differences) / 0.4549)))
+        )
+    return min(variances)
 
 
 def scatter_of_levels(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, " part"]:
-    """1σ of both parts of the force over the stated one, level by level.
+    """1σ of each part of the force over the stated one, level by level.
 
-    By second differences along the resonance; 1 where no level has three states.
+    From second differences along the resonance; 1 where no level has three states.
     """
     left = misfit.noise.without_shared(fit.rows)
     parts = [some for some in along(misfit, left) if len(some) > 2]
@@ -162,5 +164,5 @@ def scatter_of_levels(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarra
 
 
 def tolerated(noise: float) -> float:
-    """Variance that counts as noise: stated a little too small it is no sign of further physics."""
+    """Variance that counts as noise, with tolerance for noise stated slightly too small."""
     return float(np.clip(noise, 1.0, priors.TOLERATED_VARIANCE))

@@ -1,1 +1,1 @@
-"""Which further test would separate models that fit equally well: optimal design."""
+"""Optimal design of the further test that separates models of equal fit."""

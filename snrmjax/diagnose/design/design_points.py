@@ -1,11 +1,11 @@
-"""Steady states that a further test could add, and how well they would separate two models."""
+"""Steady states of a possible further test, and how well they would separate two models."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.diagnose.misfit.effect_fit import EffectFit, with_errors_passed_on
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, with_propagated_errors
 from snrmjax.diagnose.misfit.noise_model import SharedCovariance, shared_covariance, unit_columns
 from snrmjax.diagnose.misfit.predictions import Predicted, Predictions, predictions_of
 from snrmjax.diagnose.misfit.programs import COMPARED
@@ -14,9 +14,9 @@ from snrmjax.measure.states import SteadyStates, steady_states
 
 
 class DesignPoints(NamedTuple):
-    """States of a further test: motions of a measured level, scaled."""
+    """States of a further test: scaled motions of a measured level."""
 
-    level: int  # counted from zero
+    level: int  # index, from zero
     scale: float  # of its velocities
     phase: Float[np.ndarray, " state"]  # rad
 
@@ -31,7 +31,7 @@ class PredictedTest(NamedTuple):
     floor: float  # m/s, noise of harmonics
 
     def with_floor(self, floor: float) -> "PredictedTest":
-        """The same test with another noise of harmonics."""
+        """The same test with another noise of the harmonics."""
         chosen = self.misfit.predictions.chosen
         std = chosen.states.own_std * (floor / self.floor)
         chosen = chosen._replace(states=chosen.states._replace(own_std=std))
@@ -41,11 +41,11 @@ class PredictedTest(NamedTuple):
 def predicted_test(
     misfit: WeightedMisfit, fit: EffectFit, points: tuple[DesignPoints, ...], floor: float
 ) -> PredictedTest:
-    """The states of a further test, predicted by the structure that a fit describes.
+    """The states of a further test, predicted by a fitted model.
 
-    A motion is prescribed, as everywhere in a diagnosis, and its force follows: velocities of a
-    level are scaled, and frequencies are moved to where the phase is the one wanted. Noise is the
-    median of that of the measured states; `floor` is that of harmonics, m/s.
+    The motion is prescribed and the force follows: velocities of a level are scaled, and the
+    frequencies shifted to the wanted phases. The noise is the median of the measured states';
+    `floor` is that of harmonics, m/s.
     """
     states = misfit.predictions.chosen.states
     level, velocity = np.asarray(states.level), np.asarray(states.velocity)[:, 0]
@@ -58,47 +58,51 @@ def predicted_test(
         speed.append(one.scale * np.interp(one.phase, phase[order], tip[order]) * np.cos(one.phase))
         omega.append(np.interp(one.phase, phase[order], np.asarray(states.frequency)[mine][order]))
         member.append(np.full(len(one.phase), number))
-    aim = np.concatenate([point.phase for point in points])
-    size, at, whose = (np.concatenate(parts) for parts in (speed, omega, member))
+    wanted = np.concatenate([point.phase for point in points])
+    speeds, at, member_of = (np.concatenate(parts) for parts in (speed, omega, member))
     modes, j = misfit.model.modes, misfit.model.modes.mode_of_interest
     sensor = misfit.predictions.chosen.sensors[0]
     unit = float(modes.mode_shape[sensor, j] * modes.participation[j])
-    data = _states(misfit, whose, at, np.exp(1j * aim) * size, np.ones(len(at)), None, floor)
+    data = _states(
+        misfit, member_of, at, np.exp(1j * wanted) * speeds, np.ones(len(at)), None, floor
+    )
     force, _ = _needed(misfit, fit, data)
-    # The modal stiffness ω̃² − Ω² + iΩδ of the held motion, and Ω where tan φ is the one wanted.
-    stiffness = unit * force / (np.exp(1j * aim) * size / (1j * at))
-    half = 0.5 * stiffness.imag / at * np.tan(aim)
+    # Dynamic stiffness ω̃² − Ω² + iΩδ of the prescribed motion: Ω from tan φ = (ω̃² − Ω²)/(Ωδ).
+    stiffness = unit * force / (np.exp(1j * wanted) * speeds / (1j * at))
+    half = 0.5 * stiffness.imag / at * np.tan(wanted)
     square = stiffness.real + at**2 + half**2
-    moved = np.sqrt(np.maximum(square, 0.0)) - half
-    at = np.where(np.isfinite(moved) & (np.abs(moved / at - 1) < 0.5), moved, at)
-    data = _states(misfit, whose, at, np.exp(1j * aim) * size, np.ones(len(at)), None, floor)
+    shifted = np.sqrt(np.maximum(square, 0.0)) - half
+    at = np.where(np.isfinite(shifted) & (np.abs(shifted / at - 1) < 0.5), shifted, at)
+    data = _states(
+        misfit, member_of, at, np.exp(1j * wanted) * speeds, np.ones(len(at)), None, floor
+    )
     force, harmonics = _needed(misfit, fit, data)
-    good = np.isfinite(np.abs(force)) & np.all(np.isfinite(harmonics), axis=1)
-    turn = np.exp(-1j * np.angle(force))
-    seen = harmonics * turn[:, None] ** np.array(COMPARED)
-    own = np.exp(1j * aim) * size * turn
-    found = _states(
-        misfit, whose[good], at[good], own[good], np.abs(force)[good], seen[good], floor
+    valid = np.isfinite(np.abs(force)) & np.all(np.isfinite(harmonics), axis=1)
+    rotation = np.exp(-1j * np.angle(force))
+    seen = harmonics * rotation[:, None] ** np.array(COMPARED)
+    own = np.exp(1j * wanted) * speeds * rotation
+    predicted = _states(
+        misfit, member_of[valid], at[valid], own[valid], np.abs(force)[valid], seen[valid], floor
     )
     before = misfit.predictions
-    predictions = predictions_of(misfit.model, found, before.force_gain_std, kinds=before.kinds)
-    rows = tuple(whose[good] == number for number in range(len(points)))
-    phases = np.angle(np.asarray(found.velocity)[:, sensor])
+    predictions = predictions_of(misfit.model, predicted, before.force_gain_std, kinds=before.kinds)
+    rows = tuple(member_of[valid] == number for number in range(len(points)))
+    phases = np.angle(np.asarray(predicted.velocity)[:, sensor])
     at_resonance = []
-    for column in (found.force, found.frequency):  # where the phase is zero; NaN without states
+    for column in (predicted.force, predicted.frequency):  # at zero phase
         own = []
         for mine in rows:
             order = np.flatnonzero(mine)[np.argsort(phases[mine])]
             known = order.size > 0
             own.append(float(np.interp(0.0, phases[order], column[order])) if known else np.nan)
         at_resonance.append(tuple(own))
-    passed_on = with_errors_passed_on(weighted_misfit(predictions), fit)
-    return PredictedTest(passed_on, rows, at_resonance[0], at_resonance[1], floor)
+    propagated = with_propagated_errors(weighted_misfit(predictions), fit)
+    return PredictedTest(propagated, rows, at_resonance[0], at_resonance[1], floor)
 
 
 def _states(
     misfit: WeightedMisfit,
-    whose: Int[np.ndarray, " state"],
+    member_of: Int[np.ndarray, " state"],
     omega: Float[np.ndarray, " state"],
     velocity: Complex[np.ndarray, " state"],
     force: Float[np.ndarray, " state"],
@@ -113,7 +117,7 @@ def _states(
     alone[:, sensor] = 1.0
     seen = np.zeros((n, len(COMPARED))) if harmonics is None else harmonics
     return steady_states(
-        whose,
+        member_of,
         omega,
         force,
         alone * velocity[:, None],
@@ -122,7 +126,7 @@ def _states(
         velocity_std=error[1] * np.abs(velocity)[:, None] * alone,
         phase_std=error[1 + len(sensors)] * alone,
         force_std=error[0] * force,
-        order=np.ones(n),  # after the test
+        order=np.ones(n),  # after the former test
         harmonics=alone[:, :, None] * seen[:, None, :],
         harmonic_std=np.full((n, len(sensors)), floor),
         harmonic_order=COMPARED,
@@ -133,11 +137,11 @@ def _states(
 def _needed(
     misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates
 ) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, "state harmonic"]]:
-    """The force that motions need under a fit, for one newton recorded, and their harmonics."""
+    """The force that a fit requires for motions, per newton recorded, and their harmonics."""
     predictions = predictions_of(misfit.model, data, kinds=misfit.predictions.kinds)
-    given = misfit.baseline_parameters(fit.rows)
-    values = np.append(list(given.values()), fit.values)
-    columns = predictions.of(predictions.group.at((*given, *fit.labels), values)[None]).columns[0]
+    linear = misfit.baseline_parameters(fit.rows)
+    values = np.append(list(linear.values()), fit.values)
+    columns = predictions.of(predictions.group.at((*linear, *fit.labels), values)[None]).columns[0]
     parts = columns[:, 0::2] + 1j * columns[:, 1::2]
     first = len(predictions.chosen.sensors)  # the reference sensor's harmonics come first
     higher = parts[:, first : first + len(COMPARED)]
@@ -146,7 +150,7 @@ def _needed(
 
 
 def columns_of(predictions: Predictions, fit: EffectFit) -> Predicted | None:
-    """Columns of all states under a fit's parameters; None where no program has all its effects."""
+    """Columns of all states for a fit's parameters; None where the group lacks an effect of it."""
     if not set(fit.labels) <= set(predictions.group.names):
         return None
     return predictions.of(predictions.group.at(fit.labels, fit.values)[None], fit.labels)
@@ -160,26 +164,23 @@ class Rows(NamedTuple):
 
 
 class ModelRows(NamedTuple):
-    """Rows of one model: of the measured states, with the χ² left there, and of a further test."""
+    """Rows of one model: measured states, their χ² after the fit, and a further test."""
 
     measured: Rows
     least: float
     further: Rows
 
 
-def in_noise_units(misfit: WeightedMisfit, found: Predicted) -> Rows:
+def in_noise_units(misfit: WeightedMisfit, predicted: Predicted) -> Rows:
     """Predictions of one trial in units of noise."""
-    slopes = misfit.noise.noise_units(np.moveaxis(found.slopes[0], 2, 0))
-    return Rows(misfit.noise.noise_units(found.columns)[0], slopes.T)
+    slopes = misfit.noise.noise_units(np.moveaxis(predicted.slopes[0], 2, 0))
+    return Rows(misfit.noise.noise_units(predicted.columns)[0], slopes.T)
 
 
 def shared_by_both(
     old: WeightedMisfit, new: WeightedMisfit, kept: Bool[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row shared"]:
-    """Errors shared by measured states and a further test: the baseline's, not the levels'.
-
-    A force of a level that is free is one of the levels'.
-    """
+    """Sensitivities to shared errors: the baseline's are common to both tests, the levels' not."""
     parts = old.noise.shared, new.noise.shared[kept]
     n = old.predictions.n_baseline_errors
     common, apart = [part[:, :n] for part in parts], [part[:, n:] for part in parts]
@@ -194,11 +195,11 @@ def shared_by_both(
 
 
 def refitted_chi_square(rows: Rows, covariance: SharedCovariance) -> float:
-    """χ² when a fit's parameters have moved to where all rows put them, to first order."""
+    """χ² after a refit of the parameters to all rows, to first order."""
     sensitivities, left = unit_columns(rows.slopes)[0], covariance.decorrelated(rows.left)
     sensitivities = covariance.decorrelated(sensitivities.T).T
     along, values, _ = np.linalg.svd(sensitivities, full_matrices=False)
-    # Directions that no state determines stay open.
+    # Directions that no state determines are left out.
     along = along[:, values > 1e-12 * max(values.max(initial=0.0), 1.0)]
     return float(np.sum((left - along @ (along.T @ left)) ** 2))
 
@@ -210,10 +211,10 @@ def separation(
     rival: ModelRows,
     kept: Bool[np.ndarray, " row"],
 ) -> float:
-    """How much more χ² grows for a rival than for the truth by some rows of a further test.
+    """The gain in χ² of a rival over the assumed truth by some rows of a further test.
 
-    Each is refitted to the measured rows and those of the test, with their shared errors. Rows for
-    which one of the two has no motion do not count.
+    Each is refitted to the measured and the further rows, with their shared errors. Rows for which
+    one of the two has no motion are left out.
     """
     for _, _, rows in (truth, rival):
         kept = kept & np.isfinite(rows.left) & np.all(np.isfinite(rows.slopes), axis=1)

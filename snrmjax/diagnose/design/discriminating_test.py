@@ -19,7 +19,7 @@ from snrmjax.diagnose.design.design_points import (
     refitted_chi_square,
     separation,
 )
-from snrmjax.diagnose.fitted_effects import FoundEffects
+from snrmjax.diagnose.fitted_effects import FittedEffects
 from snrmjax.diagnose.misfit.candidates import decide_by, only_by_calibration
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.predictions import Predicted
@@ -28,19 +28,19 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.numerics.facts import Fact
 
 STATES = 12
-"""Of a level, or off resonance, in a further test."""
+"""Number of states of a further test."""
 
 
-class ProposedLevel(NamedTuple):
-    """Where in the measured range a test is, by its resonance."""
+class OperatingPoint(NamedTuple):
+    """The level of a proposed test, and force and frequency at its resonance."""
 
-    level: int  # that is measured again, or whose velocities are scaled
+    level: int  # measured again, or with scaled velocities
     force: float  # N
     frequency: float  # Hz
 
 
 class PlannedStates(NamedTuple):
-    """The steady states of a test as the answer predicts them."""
+    """The steady states of a test, as predicted by the answer."""
 
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N
@@ -50,62 +50,63 @@ class PlannedStates(NamedTuple):
 class DiscriminatingTest(NamedTuple):
     """A test that is expected to separate the models that a diagnosis could not.
 
-    What does not apply is None: a calibration has no level, and only harmonics have a noise that
-    they need.
+    What does not apply is None, such as the level of a calibration.
     """
 
     kind: str  # "harmonics", "off_resonance", "lower_level", "higher_level", "calibration"
-    measurement: Fact | None = None  # where to measure what, and how the models differ there
-    quantity: str | None = None  # in which the models differ most: "harmonic 2", "velocity", …
-    place: ProposedLevel | None = None
+    measurement: Fact | None = None  # what to measure where, and how the models differ there
+    quantity: str | None = None  # with the largest difference: "harmonic 2", "velocity", …
+    operating_point: OperatingPoint | None = None
     states: int | None = None
     phase: tuple[float, float] | None = None  # degrees off resonance, on both sides
     harmonics: tuple[int, ...] = ()
-    harmonic_std: float | None = None  # m/s, that they need
-    expected_gain: float | None = None  # of χ² over the rival that is separated least well
+    harmonic_std: float | None = None  # m/s, required noise of these
+    expected_gain: float | None = None  # of χ², over the closest rival
     needed_gain: float | None = None
-    calibration_too: bool = False  # whether effects stay open that only a calibration separates
+    calibration_too: bool = False  # whether some effects need a calibration to be separated
     planned: PlannedStates | None = None
 
     @property
     def settles(self) -> bool:
-        """Whether the expected gain is enough."""
+        """Whether the expected gain suffices."""
         if self.expected_gain is None or self.needed_gain is None:
             return self.kind == "calibration"
         return self.expected_gain >= self.needed_gain
 
 
 class _Option(NamedTuple):
-    """Some rows of a predicted test."""
+    """A measurement to compare: some rows of a predicted test."""
 
     kind: str
-    place: int  # of the design points
-    orders: tuple[int, ...]  # of harmonics that count
+    points: int  # index of the design points
+    orders: tuple[int, ...]  # of harmonics used
     of_force: bool
-    floor: float | None  # m/s, that harmonics need
+    floor: float | None  # m/s, required noise of harmonics
 
 
-def discriminating_test(found: FoundEffects, places: tuple[int, ...]) -> DiscriminatingTest | None:
-    """The cheapest test that is expected to reject the competing models of some classes.
+def discriminating_test(
+    fitted: FittedEffects, indices: tuple[int, ...]
+) -> DiscriminatingTest | None:
+    """The cheapest test that is expected to reject the rival models of some classes.
 
-    Every member of a class at one of the `places` is taken for true in turn and predicts the test;
-    its rivals are refitted to the measured and the further states together, to first order. A
-    test is enough where it leaves the rivals behind with 95 % probability. Where none is enough
-    it is the one that comes nearest; None where no rival can be compared.
+    Each member of the classes with these `indices` is assumed true in turn and predicts the test;
+    its rivals are refitted to the measured and further states together, to first order. A test
+    suffices if it rejects all rivals with 95 % probability. If none does, the best one is returned;
+    None where no rival can be compared.
     """
-    misfit = found.misfit
+    misfit = fitted.misfit
     speed = np.abs(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
     floor = _floor(misfit)
-    # Without any, that of harmonics which are measured without special care.
+    # Without recorded harmonics: typical noise, 0.3 % of the largest velocity.
     ordinary = floor if floor is not None else 3e-3 * float(speed.max())
-    groups = [list(_rivals(found, place)) for place in places]
+    groups = [list(_rivals(fitted, index)) for index in indices]
     all_rivals = [rival for group in groups for rival in group]
-    tried = [(found.fit, all_rivals)]
-    tried += [(truth, [found.fit, *group]) for group in groups for truth in group]
+    tried = [(fitted.fit, all_rivals)]
+    tried += [(truth, [fitted.fit, *group]) for group in groups for truth in group]
     hypotheses = []
     for truth, rivals in tried:
         differ = [set(truth.kinds) ^ set(fit.kinds) for fit in rivals]
-        # Some answers differ only by what a calibration separates.
+        # Leave out rivals that only a calibration separates.
         distinct = [
             fit
             for fit, kinds in zip(rivals, differ, strict=True)
@@ -142,7 +143,7 @@ def _floor(misfit: WeightedMisfit) -> float | None:
 
 
 def _design_points(misfit: WeightedMisfit) -> tuple[DesignPoints, ...]:
-    """The largest level as it is, both ends off resonance, a smaller level and larger ones."""
+    """The largest level again, off resonance at both ends, a smaller level and larger ones."""
     states = misfit.predictions.chosen.states
     level, velocity = np.asarray(states.level), np.asarray(states.velocity)[:, 0]
     peaks = [np.abs(velocity[level == k]).max() for k in range(level.max() + 1)]
@@ -161,14 +162,14 @@ def _design_points(misfit: WeightedMisfit) -> tuple[DesignPoints, ...]:
 
 
 def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Option]:
-    """Measurements, the cheapest first."""
+    """The measurements to compare, the cheapest first."""
     known = COMPARED if measured else ()
     each = [(h,) for h in COMPARED] + [COMPARED]
     if not measured:
         yield from (_Option("harmonics", 0, orders, False, ordinary) for orders in each)
-    yield from (_Option("off_resonance", place, known, True, None) for place in (1, 2))
+    yield from (_Option("off_resonance", index, known, True, None) for index in (1, 2))
     yield _Option("lower_level", 3, known, True, None)
-    yield from (_Option("higher_level", place, known, True, None) for place in (4, 5))
+    yield from (_Option("higher_level", index, known, True, None) for index in (4, 5))
     floor = ordinary
     if not measured:
         yield from (_Option("higher_level", p, COMPARED, True, floor) for p in (4, 5))
@@ -178,13 +179,13 @@ def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Op
         yield from (_Option("higher_level", p, COMPARED, True, floor) for p in (4, 5))
 
 
-def _rivals(found: FoundEffects, place: int) -> Iterator[EffectFit]:
-    """The rivals of the answer in the class at a place, with their parameters from the table."""
-    misfit = found.misfit
-    for name in found.classes[place][1:5]:
-        kinds = {name if k == place else kind for k, kind in enumerate(found.fit.kinds)}
-        # One effect with more parameters may stand for two.
-        tables = (row.parameters for step in found.table[::-1] for row in step)
+def _rivals(fitted: FittedEffects, index: int) -> Iterator[EffectFit]:
+    """The rivals of the answer within one class, with their parameters from the table."""
+    misfit = fitted.misfit
+    for name in fitted.classes[index][1:5]:
+        kinds = {name if k == index else kind for k, kind in enumerate(fitted.fit.kinds)}
+        # One effect with more parameters may replace two.
+        tables = (row.parameters for step in fitted.table[::-1] for row in step)
         by_kinds = [({label.partition(".")[0] for label in table}, table) for table in tables]
         last = [one for wanted in (kinds, {name}) for has, one in by_kinds if has == wanted][:1]
         if not last:
@@ -204,24 +205,24 @@ def _rivals(found: FoundEffects, place: int) -> Iterator[EffectFit]:
 
 
 class _Hypothesis:
-    """One model taken for true, the tests that it predicts, and its rivals."""
+    """One model assumed true, the tests that it predicts, and its rivals."""
 
     def __init__(
         self, misfit: WeightedMisfit, truth: EffectFit, rivals: list[EffectFit], floor: float
     ):
         self.misfit, self.truth, self.rivals = misfit, truth, rivals
-        self.floor = floor  # m/s, of harmonics where an option needs none
+        self.floor = floor  # m/s, noise of harmonics unless an option requires another
         self.points = _design_points(misfit)
 
     @cached_property
     def _tests(self) -> dict[float, PredictedTest]:
-        """By the noise of harmonics."""
+        """Predicted tests by noise of harmonics."""
         first = predicted_test(self.misfit, self.truth, self.points, self.floor)
         return {self.floor: first}
 
     @cached_property
     def _predicted(self) -> list[Predicted | None]:
-        """Of the truth, then of the rivals."""
+        """Predictions of the truth, then of the rivals."""
         predictions = self._tests[self.floor].misfit.predictions
         return [columns_of(predictions, fit) for fit in (self.truth, *self.rivals)]
 
@@ -232,7 +233,7 @@ class _Hypothesis:
         return [(row, refitted_chi_square(row, self.misfit.noise.covariance)) for row in rows]
 
     def expected(self, option: _Option) -> DiscriminatingTest | None:
-        """The expected gain of an option over the rival that it separates least well."""
+        """The expected gain of an option, over the closest rival."""
         floor = self.floor if option.floor is None else option.floor
         if floor not in self._tests:
             self._tests[floor] = self._tests[self.floor].with_floor(floor)
@@ -242,37 +243,37 @@ class _Hypothesis:
         if exact is None or not kept.any():
             return None
         true_rows = ModelRows(*self._measured[0], in_noise_units(test.misfit, exact))
-        found = []
-        for fit, before, its in zip(self.rivals, self._measured[1:], others, strict=True):
-            if its is None:
+        gains = []
+        for fit, before, prediction in zip(self.rivals, self._measured[1:], others, strict=True):
+            if prediction is None:
                 continue
-            rival = ModelRows(*before, in_noise_units(test.misfit, its))
+            rival = ModelRows(*before, in_noise_units(test.misfit, prediction))
             gain = separation(self.misfit, test.misfit, true_rows, rival, kept)
-            # A gain G of χ² scatters by 2√G.
+            # A gain G of χ² has the standard deviation 2√G: require G − 1.64·2√G ≥ least.
             ahead = fit.criterion - self.truth.criterion
             least = max(priors.AS_GOOD_BY_CRITERION - ahead, 0.0)
             needed = float((priors.ONE_SIDED + np.sqrt(priors.ONE_SIDED**2 + least)) ** 2)
-            found.append(
-                (gain, needed, *_difference(test, (self.truth, exact), (fit, its), option))
+            gains.append(
+                (gain, needed, *_difference(test, (self.truth, exact), (fit, prediction), option))
             )
-        if not found:
+        if not gains:
             return None
-        gain, needed, quantity, difference = min(found, key=lambda one: one[0] / one[1])
-        points, rows = self.points[option.place], test.members[option.place]
+        gain, needed, quantity, difference = min(gains, key=lambda one: one[0] / one[1])
+        points, rows = self.points[option.points], test.members[option.points]
         states = test.misfit.predictions.chosen.states
         columns = (states.frequency, states.force, np.abs(states.velocity[:, 0]))
         planned = PlannedStates(*(np.asarray(column)[rows] for column in columns))
-        place = ProposedLevel(
+        operating_point = OperatingPoint(
             level=int(self.misfit.level_numbers[points.level]),
-            force=test.force[option.place],
-            frequency=test.frequency[option.place] / (2 * np.pi),
+            force=test.force[option.points],
+            frequency=test.frequency[option.points] / (2 * np.pi),
         )
         harmonics = option.orders if option.floor is not None else ()
-        size = np.degrees(np.abs(points.phase))
+        phase_deg = np.degrees(np.abs(points.phase))
         measurement = Fact(
             "measure_test",
             kind=option.kind,
-            **place._asdict(),
+            **operating_point._asdict(),
             scale=points.scale,
             states=STATES,
             harmonics=harmonics,
@@ -284,9 +285,9 @@ class _Hypothesis:
             kind=option.kind,
             measurement=measurement,
             quantity=quantity,
-            place=place,
+            operating_point=operating_point,
             states=len(points.phase),
-            phase=(float(size.min()), float(size.max())),
+            phase=(float(phase_deg.min()), float(phase_deg.max())),
             harmonics=harmonics,
             harmonic_std=option.floor,
             expected_gain=float(gain),
@@ -297,7 +298,7 @@ class _Hypothesis:
 
 def _rows(test: PredictedTest, option: _Option) -> Bool[np.ndarray, " row"]:
     noise = test.misfit.noise
-    chosen = test.members[option.place][noise.state]
+    chosen = test.members[option.points][noise.state]
     first = 2 * len(test.misfit.predictions.chosen.sensors)
     wanted = [noise.column < 2] if option.of_force else []
     for order in option.orders:
@@ -312,12 +313,12 @@ def _difference(
     rival: tuple[EffectFit, Predicted],
     option: _Option,
 ) -> tuple[str, Fact]:
-    """In what two models differ most under an option, and by how much."""
+    """The quantity with the largest difference between two models, and the difference."""
     states = test.misfit.predictions.chosen.states
     velocity, omega = np.asarray(states.velocity)[:, 0], np.asarray(states.frequency)
     columns = rival[1].columns[0] - truth[1].columns[0]
     apart = columns[:, 0::2] + 1j * columns[:, 1::2]
-    rows = np.flatnonzero(test.members[option.place])
+    rows = np.flatnonzero(test.members[option.points])
     rows = rows[np.isfinite(apart[rows]).all(axis=1)]
     kinds = truth[0].kinds, rival[0].kinds
     models = tuple(tuple(kind for kind in kinds[k] if kind not in kinds[1 - k]) for k in range(2))
@@ -325,73 +326,76 @@ def _difference(
         return "velocity", Fact("motion_of_one", models=models)
     at = rows[np.argmin(np.abs(np.angle(velocity[rows])))]
     if option.floor is not None:
-        places = [COMPARED.index(h) for h in option.orders]
-        first = np.asarray(states.harmonics)[at, 0, places] / np.abs(velocity[at])
+        indices = [COMPARED.index(h) for h in option.orders]
+        first = np.asarray(states.harmonics)[at, 0, indices] / np.abs(velocity[at])
         second = (
-            first + apart[at, [len(test.misfit.predictions.chosen.sensors) + k for k in places]]
+            first + apart[at, [len(test.misfit.predictions.chosen.sensors) + k for k in indices]]
         )
         most = int(np.argmax(np.abs(first - second)))
-        sizes = np.abs([first[most], second[most]])
-        turned = abs(np.degrees(np.angle(second[most] / first[most]))) if sizes.min() > 0 else 0.0
-        seen = sizes.min() > 0.1 * sizes.max() and turned > 1.0
-        harmonic = {"harmonic": option.orders[most], "fractions": tuple(sizes.tolist())}
-        turn = {"turned_deg": float(turned) if seen else None}
-        difference = Fact("harmonics_apart", models=models, **harmonic, **turn)
+        magnitudes = np.abs([first[most], second[most]])
+        rotation = (
+            abs(np.degrees(np.angle(second[most] / first[most]))) if magnitudes.min() > 0 else 0.0
+        )
+        visible = magnitudes.min() > 0.1 * magnitudes.max() and rotation > 1.0
+        harmonic = {"harmonic": option.orders[most], "fractions": tuple(magnitudes.tolist())}
+        turned = {"turned_deg": float(rotation) if visible else None}
+        difference = Fact("harmonics_apart", models=models, **harmonic, **turned)
         return f"harmonic {option.orders[most]}", difference
     if option.kind == "off_resonance":
         fraction = float(np.abs(apart[rows, 0]).max())
         return "velocity", Fact("velocities_apart", models=models, fraction=fraction)
-    # The force goes with iΩδ + Δω̃² there: more of it is less velocity, or a higher frequency.
+    # At resonance F ∝ iΩδ + Δω̃²: more damping lowers the velocity, more stiffness shifts Ω.
     modes, j = test.misfit.model.modes, test.misfit.model.modes.mode_of_interest
-    slower = float(apart[at, 0].real)
+    velocity_drop = float(apart[at, 0].real)
     shift = -float(apart[at, 0].imag * modes.damping_ratio[j])
-    if abs(slower) > 50 * abs(shift):  # a careful test resolves 1 % of one, 0.02 % of the other
-        quantity, size = "velocity", float(np.abs(velocity[at]))
-        values = size, size / max(1 + slower, 0.1)
+    # A careful test resolves 1 % of velocity, 0.02 % of frequency.
+    if abs(velocity_drop) > 50 * abs(shift):
+        quantity, value = "velocity", float(np.abs(velocity[at]))
+        values = value, value / max(1 + velocity_drop, 0.1)
     else:
-        quantity, size = "frequency", float(omega[at]) / (2 * np.pi)
-        values = size, size * (1 + shift)
+        quantity, value = "frequency", float(omega[at]) / (2 * np.pi)
+        values = value, value * (1 + shift)
     return quantity, Fact("resonances_apart", models=models, quantity=quantity, values=values)
 
 
-def recommended_test(found: FoundEffects) -> DiscriminatingTest | None:
-    """The test that is expected to separate the effects that fit equally well.
+def recommended_test(fitted: FittedEffects) -> DiscriminatingTest | None:
+    """The test that is expected to separate effects of equal fit.
 
-    A calibration where nothing else separates them; None where nothing is open.
+    A calibration where nothing else separates them; None if nothing is open.
     """
-    static = [only_by_calibration(group) for group in found.classes]
-    places = tuple(
+    static = [only_by_calibration(group) for group in fitted.classes]
+    indices = tuple(
         k
-        for k, (group, alike) in enumerate(zip(found.classes, static, strict=True))
+        for k, (group, alike) in enumerate(zip(fitted.classes, static, strict=True))
         if len(group) > 1 and set(group) - alike
     )
-    test = discriminating_test(found, places) if places else None
+    test = discriminating_test(fitted, indices) if indices else None
     if test is not None:
         return test._replace(calibration_too=any(static))
     return DiscriminatingTest("calibration") if any(static) else None
 
 
 def recommendation(
-    found: FoundEffects,
+    fitted: FittedEffects,
     test: DiscriminatingTest | None,
     *,
     phases: bool,
 ) -> Fact | None:
-    """What would decide, each measurement once; None if nothing is open.
+    """The measurements that would decide, without duplicates; None if nothing is open.
 
-    Arguments: `phases` says whether the phases of the velocity are known.
+    Arguments: `phases`: whether the phases of the velocity are known.
     """
-    groups = [set(group) for group in found.classes if len(group) > 1]
-    asked: list[Fact | str] = []
+    groups = [set(group) for group in fitted.classes if len(group) > 1]
+    measurements: list[Fact | str] = []
     if groups and not phases:
-        asked.append(Fact("record_phase"))
+        measurements.append(Fact("record_phase"))
     if test is None or test.measurement is None:
-        harmonics = bool(found.misfit.predictions.chosen.orders)
-        asked += decide_by(set().union(*groups), harmonics=harmonics) if groups else []
+        harmonics = bool(fitted.misfit.predictions.chosen.orders)
+        measurements += decide_by(set().union(*groups), harmonics=harmonics) if groups else []
     else:
         for static in map(only_by_calibration, groups):
-            asked += decide_by(static, harmonics=True) if static else []
-        asked += [] if test.settles else [Fact("no_test_settles")]
-        asked.append(test.measurement)
-    asked = list(dict.fromkeys(asked))
-    return Fact("recommendation", measurements=tuple(asked)) if asked else None
+            measurements += decide_by(static, harmonics=True) if static else []
+        measurements += [] if test.settles else [Fact("no_test_settles")]
+        measurements.append(test.measurement)
+    measurements = list(dict.fromkeys(measurements))
+    return Fact("recommendation", measurements=tuple(measurements)) if measurements else None

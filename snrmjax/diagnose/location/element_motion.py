@@ -1,9 +1,8 @@
 """The motion of a nonlinear element in a linear structure, at measured fundamentals.
 
-An element with the force f moves along its row, at every order h but the fundamental, as the
-structure answers to that force: X_h = −R(hΩ) F_h(X). Where the fundamental X_1 is measured, these
-are its own harmonics and its mean, recorded or not: a harmonic balance whose unknowns are those of
-the element alone.
+The relative displacement along an element's influence vector is, at every order h but the
+fundamental, the response to its force f: X_h = −R(hΩ) F_h(X). With the fundamental X_1 measured,
+this harmonic balance has the mean and the other harmonics, recorded or not, as its only unknowns.
 Reference: Krack & Gross, Harmonic Balance for Nonlinear Vibration Problems (2019), section 3.
 """
 
@@ -22,38 +21,38 @@ from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonics import HarmonicBasis, harmonic_basis, tangent_blocks
 
-OWN_ORDERS = 13  # of an element's motion
-JUMP_ORDERS = 31  # where the force jumps
-_SAMPLES = 256  # of a cycle
-_FINE = 1024  # of one in which the force jumps
-_WIDTHS = (0.2, 0.1, 0.05, 0.02)  # of a jump, over the rms velocity, from far off to the last
-_ROUNDS = 16  # of Newton's method, at most
-_SETTLED = 1e-5  # of the fundamental, that a motion may still miss
-_LEAST_STEP = 1 / 64  # of Newton's, below which a state is given up
-_BLOCK = 32  # states in one program, so that their number compiles none anew
-_QUICK = 0.2  # of what a motion missed, that a step with earlier slopes may leave
+OWN_ORDERS = 13  # orders of an element's motion
+JUMP_ORDERS = 31  # for forces with jumps
+_SAMPLES = 256  # a cycle
+_FINE = 1024  # a cycle with force jumps
+_WIDTHS = (0.2, 0.1, 0.05, 0.02)  # smoothing of jumps over the rms velocity, by continuation
+_ROUNDS = 16  # most iterations of Newton's method
+_SETTLED = 1e-5  # tolerated residual over the fundamental
+_LEAST_STEP = 1 / 64  # fraction of a Newton step below which a state is given up
+_BLOCK = 32  # states a program: a fixed number avoids recompilation
+_QUICK = 0.2  # ratio of residuals above which the slopes are recomputed
 
 
 class SurroundedElement(NamedTuple):
-    """What an element's motion follows from: per state, orders 0 to H along the row."""
+    """Data of an element's harmonic balance: by state, for orders 0 to H of its own motion."""
 
     frequency: Float[np.ndarray, " state"]  # rad/s
     receptance: Complex[np.ndarray, "state order"]  # m/N, of the structure without the element
-    motion: Complex[np.ndarray, "state order"]  # m, a first guess; its order 1 is measured
-    # Of the force by the motion's other parts, from a motion nearby; None: not known.
+    motion: Complex[np.ndarray, "state order"]  # m, initial guess; order 1 is measured
+    # Of the force by the free parts of the motion, from a nearby motion; None: not known.
     slopes: Float[np.ndarray, "state part free"] | None = None
 
     def of(self, states: Bool[np.ndarray, " state"]) -> "SurroundedElement":
-        """What belongs to some of the states."""
+        """The data of some of the states."""
         slopes = None if self.slopes is None else self.slopes[states]
         given = self.frequency[states], self.receptance[states], self.motion[states]
         return SurroundedElement(*given, slopes)
 
 
 class ElementForces(NamedTuple):
-    """Harmonics of an element's force with its own motion, orders 0 to H, and their slopes.
+    """Harmonics of an element's force at its solved motion, orders 0 to H, with derivatives.
 
-    The slopes are by the parameters, and by the cosine and the sine of the fundamental motion.
+    By the parameters, and by the cosine and the sine of the fundamental motion.
     """
 
     force: Complex[np.ndarray, "state order"]
@@ -66,7 +65,7 @@ class ElementForces(NamedTuple):
     def with_states(
         self, states: Bool[np.ndarray, " state"], others: "ElementForces"
     ) -> "ElementForces":
-        """These forces, but those of some states as others have them, one after the other."""
+        """These forces, with those of some states replaced by others, in order."""
         whole = ElementForces(*(part.copy() for part in self))
         for part, other in zip(whole, others, strict=True):
             part[states] = other
@@ -74,14 +73,14 @@ class ElementForces(NamedTuple):
 
 
 class _Formula(NamedTuple):
-    """A law, whose parameters are given apart, and how its force along a cycle is found."""
+    """A law with separate parameters, and how its force over a cycle is evaluated."""
 
     effect: Any
     quick: bool = False
-    at_samples: bool = False  # without exact times of contact, which take long to compile
+    at_samples: bool = False  # without exact contact times, which take long to compile
 
     def law(self, values: Array) -> Any:
-        """The law with its parameters."""
+        """The law with these parameters."""
         names = self.effect.parameters()
         return dataclasses.replace(self.effect, **dict(zip(names, values, strict=True)))
 
@@ -93,7 +92,7 @@ class _Formula(NamedTuple):
     def parts(
         self, values: Array, motion: Float[Array, " part"], omega: Float[Array, ""]
     ) -> Float[Array, " part"]:
-        """Parts of the force along a motion."""
+        """Real Fourier coefficients of the force along a motion."""
         law, basis = self.law(values), self.basis(motion)
         x, v = _motion(basis, motion, omega)
         if self.at_samples:
@@ -111,12 +110,11 @@ def element_forces(
     rough: bool = False,
     exact: bool = False,
 ) -> ElementForces:
-    """The forces of a law with its own motion at every state, by Newton's method.
+    """The forces of a law at the element's motion in every state, by Newton's method.
 
-    Arguments: `effect` says which law, `values` its parameters; a `rough` force has wider jumps and
-    no exact times of contact; `exact` slopes are those at the motion found, others may be from
-    nearby. States whose motion was not found are not `settled`: their forces are those of the
-    nearest motion that was.
+    Arguments: `effect`: the law; `values`: its parameters; `rough`: smoother jumps and no exact
+    contact times; `exact`: slopes at the solution, in place of possibly nearby ones. States that
+    did not converge are not `settled`: their forces are those of the last iterate.
     """
     if isinstance(effect, CoulombFriction):
         *far, last = _WIDTHS[:-1] if rough else _WIDTHS
@@ -142,69 +140,69 @@ def _solved_motion(
     n_parts = 2 * element.motion.shape[1] - 1
     free = np.delete(np.arange(n_parts), [1, 2])
     receptance = _products(element.receptance)[:, free]
-    size = np.abs(element.motion[:, 1, None])
+    amplitude = np.abs(element.motion[:, 1, None])
     motion = _real_parts(element.motion)
 
     def along(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Force, its slopes, and what the motion misses, over the fundamental."""
+        """Force, its slopes, and the residual over the fundamental."""
         force, slopes = _force_and_slopes(formula, values, motion, element.frequency)
-        missed = motion[:, free] + np.einsum("sij,sj->si", receptance, force)
-        return force, slopes, np.nan_to_num(missed / size, nan=1e9, posinf=1e9, neginf=-1e9)
+        residual = motion[:, free] + np.einsum("sij,sj->si", receptance, force)
+        return force, slopes, np.nan_to_num(residual / amplitude, nan=1e9, posinf=1e9, neginf=-1e9)
 
     def by_free(motion: np.ndarray) -> np.ndarray:
         return np.nan_to_num(_slopes_by_free(formula, values, motion, element.frequency))
 
-    force, slopes, missed = along(motion)
-    steep, fresh = element.slopes, False
-    step, fraction = np.zeros_like(missed), np.ones(len(motion))
-    for turn in range(_ROUNDS):
-        if turn:
+    force, slopes, residual = along(motion)
+    tangent, fresh = element.slopes, False
+    step, fraction = np.zeros_like(residual), np.ones(len(motion))
+    for iteration in range(_ROUNDS):
+        if iteration:
             trial = motion.copy()
             trial[:, free] += fraction[:, None] * step
-            found = along(trial)
-            ratio = np.linalg.norm(found[2], axis=1) / np.linalg.norm(missed, axis=1).clip(1e-300)
-            going = _misses(missed) > _SETTLED
+            tried = along(trial)
+            ratio = np.linalg.norm(tried[2], axis=1) / np.linalg.norm(residual, axis=1).clip(1e-300)
+            going = _largest(residual) > _SETTLED
             taken = going & (ratio < 1 - 1e-4)
-            for kept, new in zip((motion, force, slopes, missed), (trial, *found), strict=True):
+            for kept, new in zip((motion, force, slopes, residual), (trial, *tried), strict=True):
                 kept[taken] = new[taken]
             if not fresh and np.any(ratio[going] > _QUICK):
-                steep = None
+                tangent = None
             elif fresh:
-                # As much less as the step promises: the next one may be twice as long.
+                # Sufficient decrease for the step fraction: double it, else take a quarter.
                 longer = np.minimum(2 * fraction, 1.0)
                 fraction = np.where(ratio < 1 - 0.5 * fraction, longer, fraction)
                 fraction = np.where(taken | ~going, fraction, 0.25 * fraction)
-                steep = None if np.any(ratio[taken] > _QUICK) else steep
-        going = (_misses(missed) > _SETTLED) & (fraction >= _LEAST_STEP)
+                tangent = None if np.any(ratio[taken] > _QUICK) else tangent
+        going = (_largest(residual) > _SETTLED) & (fraction >= _LEAST_STEP)
         if not going.any():
             break
-        fresh = steep is None
-        if steep is None:
-            steep = by_free(motion)
-        step = -_solved(receptance, steep, missed[..., None] * size[..., None])[..., 0]
+        fresh = tangent is None
+        if tangent is None:
+            tangent = by_free(motion)
+        step = -_solved(receptance, tangent, residual[..., None] * amplitude[..., None])[..., 0]
         step[~going] = 0.0
-    if steep is None or exact:
-        steep = by_free(motion)
-    follows = -_solved(receptance, steep, receptance @ np.nan_to_num(slopes))
-    whole = (slopes + steep @ follows).swapaxes(1, 2)
+    if tangent is None or exact:
+        tangent = by_free(motion)
+    follows = -_solved(receptance, tangent, receptance @ np.nan_to_num(slopes))
+    whole = (slopes + tangent @ follows).swapaxes(1, 2)
     by = _complex(whole).swapaxes(1, 2)
-    settled = _misses(missed) <= _SETTLED
+    settled = _largest(residual) <= _SETTLED
     return ElementForces(
-        _complex(force), _complex(motion), by[..., 2:], by[..., :2], steep, settled
+        _complex(force), _complex(motion), by[..., 2:], by[..., :2], tangent, settled
     )
 
 
 def force_along(
     effect: AbstractForce, values: Float[np.ndarray, " parameter"], element: SurroundedElement
 ) -> Complex[np.ndarray, "state order"]:
-    """Harmonics of a law's force along the motions as they are given."""
+    """Harmonics of a law's force along given motions."""
     motion = _real_parts(element.motion)
     formula = _Formula(effect, at_samples=isinstance(effect, AbstractNonsmooth))
     return _complex(_force_and_slopes(formula, values, motion, element.frequency)[0])
 
 
-def _misses(missed: np.ndarray) -> np.ndarray:
-    return np.max(np.abs(missed), axis=1)
+def _largest(residual: np.ndarray) -> np.ndarray:
+    return np.max(np.abs(residual), axis=1)
 
 
 def _solved(receptance: np.ndarray, slopes: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -223,20 +221,20 @@ def _complex(parts: Float[np.ndarray, "*batch part"]) -> Complex[np.ndarray, "*b
 
 
 def _products(phasors: Complex[np.ndarray, "state order"]) -> Float[np.ndarray, "state part part"]:
-    """Multiplication by phasors as matrices on the real parts."""
+    """Multiplication by phasors, as matrices on the real Fourier coefficients."""
     n_states, n_orders = phasors.shape
-    found = np.zeros((n_states, 2 * n_orders - 1, 2 * n_orders - 1))
-    found[:, 0, 0] = phasors[:, 0].real
+    matrices = np.zeros((n_states, 2 * n_orders - 1, 2 * n_orders - 1))
+    matrices[:, 0, 0] = phasors[:, 0].real
     a = 2 * np.arange(1, n_orders) - 1
-    found[:, a, a] = found[:, a + 1, a + 1] = phasors[:, 1:].real
-    found[:, a, a + 1], found[:, a + 1, a] = phasors[:, 1:].imag, -phasors[:, 1:].imag
-    return found
+    matrices[:, a, a] = matrices[:, a + 1, a + 1] = phasors[:, 1:].real
+    matrices[:, a, a + 1], matrices[:, a + 1, a] = phasors[:, 1:].imag, -phasors[:, 1:].imag
+    return matrices
 
 
 def _force_and_slopes(
     formula: _Formula, values: np.ndarray, motion: np.ndarray, frequency: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Parts of the force, and their slopes by cosine and sine of the fundamental and by values."""
+    """Fourier coefficients of the force, with derivatives by X_1 (cos, sin) and by parameters."""
     force, slopes = _by_formulas(_some_slopes, formula, values, motion, frequency)
     return force, slopes
 
@@ -244,8 +242,8 @@ def _force_and_slopes(
 def _slopes_by_free(
     formula: _Formula, values: np.ndarray, motion: np.ndarray, frequency: np.ndarray
 ) -> np.ndarray:
-    """Slopes of the force's parts by the mean and the other harmonics of the motion."""
-    # Exact times of contact do not count: one program for both.
+    """Derivatives of the force by the mean and the other harmonics of the motion."""
+    # The same with and without exact contact times: one program for both.
     formula = formula._replace(at_samples=False)
     return _by_formulas(_other_slopes, formula, values, motion, frequency)[0]
 
@@ -253,12 +251,12 @@ def _slopes_by_free(
 def _by_formulas(
     program: Callable[..., tuple], formula: _Formula, values: np.ndarray, *states: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """By the shorter formula where there is one; NaN of it say where it does not hold."""
+    """By the quick formula where it exists and holds (it is NaN elsewhere), else in full."""
     quick = formula._replace(quick=True)
     if type(formula.effect).has_quick_formula():
-        found = by_blocks(lambda *some: program(quick, values, *some), _BLOCK, *states)
-        if all(np.all(np.isfinite(part)) for part in found):
-            return found
+        results = by_blocks(lambda *some: program(quick, values, *some), _BLOCK, *states)
+        if all(np.all(np.isfinite(part)) for part in results):
+            return results
     return by_blocks(lambda *some: program(formula, values, *some), _BLOCK, *states)
 
 
@@ -269,19 +267,19 @@ def _some_slopes(
     motion: Float[Array, "state part"],
     frequency: Float[Array, " state"],
 ) -> tuple[Float[Array, "state part"], Float[Array, "state part argument"]]:
-    # Slopes need no exact times of contact.
+    # Derivatives need no exact contact times.
     by_samples = formula._replace(at_samples=isinstance(formula.effect, AbstractNonsmooth))
 
     def one(motion: Array, omega: Array) -> tuple[Array, Array]:
         def force(given: Array) -> tuple[Array, Array]:
             x, of = jnp.split(given, [2])
-            found = by_samples.parts(of, motion.at[1:3].set(x), omega)
-            return found, found
+            parts = by_samples.parts(of, motion.at[1:3].set(x), omega)
+            return parts, parts
 
-        slopes, found = jax.jacfwd(force, has_aux=True)(jnp.concatenate([motion[1:3], values]))
+        slopes, parts = jax.jacfwd(force, has_aux=True)(jnp.concatenate([motion[1:3], values]))
         if by_samples.at_samples and not formula.at_samples:
-            found = formula.parts(values, motion, omega)
-        return found, slopes
+            parts = formula.parts(values, motion, omega)
+        return parts, slopes
 
     return jax.vmap(one)(motion, frequency)
 
@@ -293,7 +291,7 @@ def _other_slopes(
     motion: Float[Array, "state part"],
     frequency: Float[Array, " state"],
 ) -> tuple[Float[Array, "state part free"]]:
-    """By slopes at samples of forces that have them there; else by derivatives of the cycle."""
+    """From tangents at samples for forces that have them, else by differentiating the cycle."""
     free = np.delete(np.arange(motion.shape[1]), [1, 2])
 
     def of_samples(motion: Array, omega: Array) -> Array:

@@ -1,7 +1,7 @@
-"""What dry friction does where it sticks: it holds any force up to its limit.
+"""Forces of stuck dry friction: any reaction up to the friction limit.
 
-Along a motion that errs by more than itself a law of friction would make a force of full size in
-the direction of the error.
+Evaluated along a motion below its measurement error, a friction law would give its full force in
+the direction of that error.
 """
 
 import numpy as np
@@ -9,25 +9,25 @@ from jaxtyping import Complex
 
 from snrmjax.diagnose.location.element_motion import ElementForces, SurroundedElement
 
-_FIRST_OF_SQUARE = 4 / np.pi  # fundamental of a square wave over its height
+_FIRST_OF_SQUARE = 4 / np.pi  # fundamental of a square wave of height 1
 
 
-def held_forces(
-    limit: float, asked: Complex[np.ndarray, " state"], element: SurroundedElement
+def stuck_forces(
+    limit: float, required: Complex[np.ndarray, " state"], element: SurroundedElement
 ) -> ElementForces:
-    """The forces of stuck friction: those asked for, up to the fundamental of full sliding.
+    """The forces of stuck friction: the required ones, up to the fundamental of full sliding.
 
-    Arguments: `limit` of the force in N; `asked` is the fundamental of the force that the sensors
-    ask for in each state. The motion is left as it is, without harmonics.
+    Arguments: `limit`: friction limit in N; `required`: fundamental of the force that the sensors
+    require in each state. The motion is unchanged, and the force has no other harmonics.
     """
-    most, size = _FIRST_OF_SQUARE * limit, np.abs(asked)
-    over = size > most
-    direction = asked / np.where(size > 0, size, 1.0)
+    capacity, magnitude = _FIRST_OF_SQUARE * limit, np.abs(required)
+    sliding = magnitude > capacity
+    direction = required / np.where(magnitude > 0, magnitude, 1.0)
     n_states, n_orders = element.motion.shape
     force = np.zeros((n_states, n_orders), dtype=complex)
-    force[:, 1] = np.where(over, most * direction, asked)
+    force[:, 1] = np.where(sliding, capacity * direction, required)
     by_parameter = np.zeros((n_states, n_orders, 1), dtype=complex)
-    by_parameter[:, 1, 0] = np.where(over, _FIRST_OF_SQUARE * direction, 0.0)
+    by_parameter[:, 1, 0] = np.where(sliding, _FIRST_OF_SQUARE * direction, 0.0)
     return ElementForces(
         force,
         element.motion,

@@ -1,4 +1,4 @@
-"""Every effect as a candidate: its starts, its steps, and what separates it from others."""
+"""Effects as candidates: starts, steps, confounders, and fit coordinates."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from snrmjax.numerics.facts import Fact
 
 
 class EffectCandidate(NamedTuple):
-    """Starts of one kind of effect; parameters in the order of its constructor."""
+    """Starts and bounds of one kind of effect; parameters in the order of its constructor."""
 
     kind: str
     starts: tuple[tuple[float, ...], ...]
@@ -27,7 +27,7 @@ class EffectCandidate(NamedTuple):
 
 
 def candidate(kind: str, scales: MotionScales) -> EffectCandidate:
-    """Starts, units and bounds of a kind of effect, as its class states them."""
+    """Starts, units and bounds of a kind of effect, from its class."""
     effect = EFFECTS[kind]
     starts = tuple(tuple(float(v) for v in start) for start in starts_of(effect, scales))
     lower, upper = zip(*effect.bounds(scales), strict=True)
@@ -36,26 +36,26 @@ def candidate(kind: str, scales: MotionScales) -> EffectCandidate:
 
 
 def parameter_labels(kind: str) -> tuple[str, ...]:
-    """Names of a candidate's parameters as a diagnosis gives them."""
+    """Names of a candidate's parameters, as in a diagnosis."""
     return tuple(f"{kind}.{name}" for name in effect_parameters(kind))
 
 
 def only_by_calibration(kinds: Iterable[str]) -> set[str]:
-    """Those of some kinds of which another one does the same to every test of one mode."""
-    found = (
-        _confused(confounder, kinds)
+    """Those of some kinds that no test of one mode can separate, only a calibration."""
+    groups = (
+        _confounded(confounder, kinds)
         for confounder in _confounders(kinds)
         if confounder.by_calibration
     )
-    return set().union(*(group for group in found if len(group) > 1))
+    return set().union(*(group for group in groups if len(group) > 1))
 
 
 def decide_by(kinds: set[str], *, harmonics: bool) -> list[Fact | str]:
-    """The measurements that would settle which of several kinds it is, two at most."""
+    """The measurements that would decide between several kinds, two at most."""
     fitting: list[Fact | str] = [
         confounder.separated_by
         for confounder in _confounders(kinds)
-        if len(_confused(confounder, kinds)) > 1 or confounder.by_itself
+        if len(_confounded(confounder, kinds)) > 1 or confounder.by_itself
     ]
     if fitting:
         return list(dict.fromkeys(fitting))[:2]
@@ -63,34 +63,33 @@ def decide_by(kinds: set[str], *, harmonics: bool) -> list[Fact | str]:
 
 
 def _confounders(kinds: Iterable[str]) -> list[Confounder]:
-    """What some kinds may be confused with: of the library in its order, then of a user."""
-    found = [confounder for kind in kinds for confounder in EFFECTS[kind].confounders]
-    library = [one for one in CONFOUNDERS if one in found]
-    return library + [one for one in dict.fromkeys(found) if one not in CONFOUNDERS]
+    """Confounders of some kinds: the library's in its order, then a user's."""
+    every = [confounder for kind in kinds for confounder in EFFECTS[kind].confounders]
+    library = [one for one in CONFOUNDERS if one in every]
+    return library + [one for one in dict.fromkeys(every) if one not in CONFOUNDERS]
 
 
-def _confused(confounder: Confounder, kinds: Iterable[str]) -> set[str]:
-    """Those of some kinds that a confusion names."""
+def _confounded(confounder: Confounder, kinds: Iterable[str]) -> set[str]:
+    """Those of some kinds that a confounder concerns."""
     return {kind for kind in kinds if confounder in EFFECTS[kind].confounders}
 
 
 class Coordinates(NamedTuple):
-    """A law c x^p by its stiffness c R^(p − 1) at a typical amplitude R, and by p.
+    """Fit coordinates of a law c x^p: stiffness c R^(p − 1) at a typical amplitude R, and p.
 
-    Data determine the force at the measured amplitudes. The coefficient c is that at unit
-    amplitude and changes by powers of ten with the exponent: a fit in c and p would follow a
-    narrow, bent valley.
+    Data determine the force at the measured amplitudes, but c is that at unit amplitude and varies
+    by powers of ten with p: a fit in c and p would have to follow a narrow, curved valley.
     """
 
-    pairs: tuple[tuple[int, int], ...]  # places of a coefficient and its exponent
+    pairs: tuple[tuple[int, int], ...]  # indices of a coefficient and its exponent
     reference: float  # R, kg^1/2 m
 
     def inward(self, values: Float[np.ndarray, "*trial parameter"]) -> np.ndarray:
-        """Parameters as the fit sees them."""
+        """Fit coordinates from the effects' parameters."""
         return self._scaled(values, 1.0)
 
     def outward(self, inner: Float[np.ndarray, "*trial parameter"]) -> np.ndarray:
-        """Parameters of the effects."""
+        """The effects' parameters from fit coordinates."""
         return self._scaled(inner, -1.0)
 
     def slopes(
@@ -98,12 +97,12 @@ class Coordinates(NamedTuple):
         values: Float[np.ndarray, " parameter"],
         slopes: Float[np.ndarray, "row parameter"],
     ) -> Float[np.ndarray, "row parameter"]:
-        """Slopes by the fit's coordinates, of those by the effects' parameters at `values`."""
-        turned = slopes.copy()
+        """Derivatives by fit coordinates from those by the effects' parameters at `values`."""
+        transformed = slopes.copy()
         for c, p in self.pairs:
-            turned[:, p] -= values[c] * np.log(self.reference) * slopes[:, c]
-            turned[:, c] *= self.reference ** (1 - values[p])
-        return turned
+            transformed[:, p] -= values[c] * np.log(self.reference) * slopes[:, c]
+            transformed[:, c] *= self.reference ** (1 - values[p])
+        return transformed
 
     def _scaled(self, values: Float[np.ndarray, "*trial parameter"], sign: float) -> np.ndarray:
         scaled = np.array(values, dtype=float)
@@ -113,18 +112,18 @@ class Coordinates(NamedTuple):
 
 
 def coordinates(labels: Sequence[str], reference: float) -> Coordinates:
-    """Coordinates for parameters of these names; `reference` is a typical amplitude."""
+    """Coordinates for parameters of these names; `reference`: a typical amplitude."""
     pairs = []
-    for place, label in enumerate(labels):
+    for index, label in enumerate(labels):
         kind, _, name = label.partition(".")
         exponent = EFFECTS[kind].parameters()[name].exponent
         if exponent is not None:
-            pairs.append((place, labels.index(f"{kind}.{exponent}")))
+            pairs.append((index, labels.index(f"{kind}.{exponent}")))
     return Coordinates(tuple(pairs), reference)
 
 
 def motion_scales(model: Structure, chosen: ComparedColumns) -> MotionScales:
-    """Typical sizes of the motions of states that are compared with a model."""
+    """Typical magnitudes of the compared motions."""
     states, modes = chosen.states, model.modes
     columns = (np.abs(states.velocity[:, 0]), states.frequency, states.force)
     speed, omega, force = (np.asarray(part) for part in columns)
@@ -138,7 +137,7 @@ def scales_of_motions(
     omega: Float[np.ndarray, " state"],
     force: Float[np.ndarray, " state"],
 ) -> MotionScales:
-    """Typical sizes of motions, by velocity amplitudes at a sensor, frequencies and forces."""
+    """Typical magnitudes of motions, from velocity amplitudes at a sensor, frequencies, forces."""
     j = modes.mode_of_interest
     amplitude = speed / omega / abs(modes.mode_shape.item(sensor, j))
     return MotionScales(

@@ -1,9 +1,9 @@
-"""Fits of effects to a weighted misfit, made straight at the errors that a fit finds.
+"""Fits of effects to a weighted misfit, linearised about the corrected records.
 
-A gain of 15 % moves a stop or a steep curve beyond first order, and so does the error of a single
-state on a curve that is steep enough. States are compared as a hypothesis has them without these
-errors, and the misfit is carried back to the record by its slopes there, so that errors keep their
-priors (orthogonal distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908085).
+A gain error of 15 % acts on a stop or a steep curve beyond first order, and so may the error of a
+single state. The model is therefore evaluated at the records less their estimated errors, and the
+misfit is linearised from there to the records, so that the errors keep their priors (orthogonal
+distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908085).
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, m
 
 _log = logging.getLogger(__name__)
 
-# Of a fit: an evaluation costs many motions, and rivals far behind need not be known to digits.
+# An evaluation costs many motions, and poor fits need no precision.
 _RULE = StepRule(
     steps=9,
     settled=0.02,
@@ -43,7 +43,7 @@ class EffectFit(NamedTuple):
     labels: tuple[str, ...]
     values: Float[np.ndarray, " parameter"]
     chi_square: float
-    rows: Float[np.ndarray, " row"]  # misfits that are left, in units of noise
+    rows: Float[np.ndarray, " row"]  # remaining misfits, in units of noise
     slopes: Float[np.ndarray, "row parameter"]
     lower: Float[np.ndarray, " parameter"]
     upper: Float[np.ndarray, " parameter"]
@@ -61,12 +61,12 @@ class EffectFit(NamedTuple):
 
     @property
     def p_value(self) -> float:
-        """Probability by chance of at least the misfit that is left."""
+        """p-value of the remaining misfit."""
         return chi_square_p_value(self.chi_square, len(self.rows) - len(self.values))
 
 
 class _Evaluated(NamedTuple):
-    """The problem at one point: a `Linearisation` in the coordinates of the fit."""
+    """The problem at one point: a `Linearisation` in fit coordinates."""
 
     values: Float[np.ndarray, " parameter"]
     rows: Float[np.ndarray, " row"]
@@ -86,49 +86,49 @@ def baseline_fit(misfit: WeightedMisfit) -> EffectFit:
 def fit_effect(
     misfit: WeightedMisfit,
     candidate: EffectCandidate,
-    beside: EffectFit | None = None,
+    earlier: EffectFit | None = None,
 ) -> EffectFit:
-    """The best fit of a candidate from all its starting points, beside what was fitted before.
+    """The best fit of a candidate from all its starts, in addition to an earlier fit.
 
-    All parameters are free, those of `beside` too. The `status` says whether a minimum was found.
+    All parameters are free, also those of `earlier`; `status` shows whether it is a minimum.
     """
-    before = beside or baseline_fit(misfit)
+    before = earlier or baseline_fit(misfit)
     labels = (*parameter_labels(candidate.kind), *before.labels)
-    law = coordinates(labels, scales_of(misfit.predictions).amplitude)
+    transform = coordinates(labels, scales_of(misfit.predictions).amplitude)
     n, m = len(candidate.unit), len(before.values)
-    size = np.where(before.values, np.abs(before.values), 1)
-    unit = law.inward(np.concatenate([candidate.unit, size]))
-    # Of what the coordinates scale, bounds are zero and infinity.
+    magnitude = np.where(before.values, np.abs(before.values), 1)
+    unit = transform.inward(np.concatenate([candidate.unit, magnitude]))
+    # Scaled coordinates have bounds zero and infinity: no transformation needed.
     lower = np.concatenate([candidate.lower, before.lower])
     upper = np.concatenate([candidate.upper, before.upper])
 
     def evaluated(values: np.ndarray) -> list[_Evaluated]:
-        found = []
+        points = []
         together = misfit.evaluated(labels, values)
         for parameters, rows, slopes in zip(values, *together, strict=True):
-            by = law.slopes(parameters, slopes) * unit
+            by = transform.slopes(parameters, slopes) * unit
             left, sensitivities = misfit.noise.decorrelated(rows), misfit.noise.decorrelated(by.T).T
-            found.append(_Evaluated(parameters, rows, slopes, by, left, sensitivities))
-        return found
+            points.append(_Evaluated(parameters, rows, slopes, by, left, sensitivities))
+        return points
 
     def linearised(points: np.ndarray) -> list[_Evaluated]:
-        return evaluated(law.outward(points * unit))
+        return evaluated(transform.outward(points * unit))
 
     starts = np.array(candidate.starts)
     all_starts = np.concatenate([starts, np.tile(before.values, (len(starts), 1))], axis=1)
-    points, at_points = law.inward(all_starts) / unit, evaluated(all_starts)
+    points, at_points = transform.inward(all_starts) / unit, evaluated(all_starts)
     for _ in range(3):
         lost = [t for t, one in enumerate(at_points) if not np.all(np.isfinite(one.residuals))]
         if not lost:
             break
-        points[lost, 0] *= 0.3  # too strong to have a motion
+        points[lost, 0] *= 0.3  # too strong: no motion of this amplitude
         for t, one in zip(lost, linearised(points[lost]), strict=True):
             at_points[t] = one
     ends = minimise(linearised, points, at_points, (lower / unit, upper / unit), _RULE)
     best = min(ends, key=lambda end: end.sum_of_squares)
     at, values = best.linearised, best.linearised.values
     if np.any(best.last_step):
-        values = law.outward(best.point * unit)
+        values = transform.outward(best.point * unit)
     order = [*range(n, n + m), *range(n)]
     return EffectFit(
         kinds=(*before.kinds, candidate.kind),
@@ -143,24 +143,24 @@ def fit_effect(
     )
 
 
-def with_errors_passed_on(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:
-    """The misfit with errors passed on as the fitted model passes them, the baseline's too.
+def with_propagated_errors(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:
+    """The misfit with errors propagated through the fitted model, also those of the baseline.
 
-    An effect that turns or scales a quantity turns and scales its errors too.
+    An effect that scales or rotates a phasor also scales or rotates its errors.
     """
     predictions, known, values = misfit.predictions, misfit.errors, values_of(misfit, fit)
     if not fit.kinds:
         return misfit.reweighted(known)
     slopes = by_baseline(predictions, values).slopes[0]
-    there = ErrorPropagation(*predictions.by_error(values), slopes)
-    changes = (np.where(np.isfinite(a - b), a - b, 0.0) for a, b in zip(there, known, strict=True))
+    fitted = ErrorPropagation(*predictions.by_error(values), slopes)
+    changes = (np.where(np.isfinite(a - b), a - b, 0.0) for a, b in zip(fitted, known, strict=True))
     return misfit.reweighted(
         ErrorPropagation(*(a + b for a, b in zip(known, changes, strict=True)))
     )
 
 
 def at_phases_of(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:
-    """The misfit with velocities of unknown phase where a fit has them."""
+    """The misfit with unknown phases set to those of a fit."""
     force = misfit.baseline.force
     if fit.kinds:
         force = misfit.predictions.of(values_of(misfit, fit)[None]).phasors[0, :, 0]
@@ -168,7 +168,7 @@ def at_phases_of(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:
 
 
 def values_of(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, " parameter"]:
-    """A fit's parameters among those of all effects."""
+    """The group's parameters with the values of a fit."""
     return misfit.predictions.group.at(fit.labels, fit.values)
 
 
@@ -178,25 +178,25 @@ def without_errors(
     data: SteadyStates,
     added: Float[np.ndarray, "state input"],
 ) -> WeightedMisfit:
-    """The misfit made straight where records have something added to them, as a fit has it there.
+    """The misfit linearised about the records with `added` corrections, for the values of a fit.
 
-    `data` are the records as they were measured.
+    `data`: the records as measured.
     """
     return misfit.about(misfit.predictions.of_records(data, added), values_of(misfit, fit))
 
 
 def at_reference(old: Predictions, data: SteadyStates) -> Predictions:
-    """Predictions of the records without the errors that smooth curves find, whatever the law is.
+    """Predictions at the records less the errors estimated by smooth curves, whatever the law.
 
-    Fits of effects begin there.
+    Fits of effects start from these.
     """
     reference = old.reference
     if reference is None or reference.posterior.states.force_is_free:
         return old
-    found, error = reference.posterior, np.asarray(old.chosen.states.error)
+    posterior, error = reference.posterior, np.asarray(old.chosen.states.error)
     n_sensors = (error.shape[1] - 1) // 2
-    added, level = np.zeros_like(error), found.states.level
-    errors = found.corrections[:, 1:3] - found.level_errors[level][:, :2]
+    added, level = np.zeros_like(error), posterior.states.level
+    errors = posterior.corrections[:, 1:3] - posterior.level_errors[level][:, :2]
     added[reference.rows, 1 : n_sensors + 1] = errors[:, [0]]
     added[reference.rows, n_sensors + 1 :] = errors[:, [1]]
     return old.of_records(data, added)
@@ -205,22 +205,22 @@ def at_reference(old: Predictions, data: SteadyStates) -> Predictions:
 def likely_errors(
     misfit: WeightedMisfit, rows: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, "state input"]:
-    """What a fit adds to logarithms of velocities and to phases: of levels and of single states."""
+    """Corrections of log velocities and phases estimated by a fit, of levels and of states."""
     noise, states = misfit.noise, misfit.predictions.chosen.states
     level, error = np.asarray(states.level), np.asarray(states.error)
     n_inputs = error.shape[1]
     n_sensors = (n_inputs - 1) // 2
-    pull = np.zeros(noise.known.shape)
-    pull[noise.known] = noise.without_shared(rows)
-    pull = np.einsum("sij,si->sj", noise.whiten, pull)
-    added = -np.einsum("sci,sc->si", misfit.passed_on.by_error, pull) * error**2
-    added[:, 0] = 0.0  # of a force: straight as it is
-    moved = noise.shared_errors(rows)
+    score = np.zeros(noise.known.shape)
+    score[noise.known] = noise.without_shared(rows)
+    score = np.einsum("sij,si->sj", noise.whiten, score)
+    added = -np.einsum("sci,sc->si", misfit.propagated.by_error, score) * error**2
+    added[:, 0] = 0.0  # force errors act linearly: no correction
+    shared_errors = noise.shared_errors(rows)
     ends = slice(1, 1 + n_sensors), slice(1 + n_sensors, n_inputs)
     for std, kind, own in zip(misfit.predictions.model.level_stds[:2], (0, 1), ends, strict=True):
-        shared = moved[noise.shared_kind == kind]
+        shared = shared_errors[noise.shared_kind == kind]
         if shared.size:
             added[:, own] += (std * shared[level])[:, None]
     unknown = np.asarray(misfit.predictions.chosen.phase_unknown)[:, 0]
-    added[unknown] = 0.0  # of sizes alone nothing is straight
+    added[unknown] = 0.0  # magnitudes alone: no correction
     return np.where(np.isfinite(added), added, 0.0)

@@ -1,4 +1,4 @@
-"""Which part of the force balance disagrees: stiffness, damping, harmonics, or none of them."""
+"""Parts of the force balance with a misfit: stiffness, damping, harmonics, or none of them."""
 
 from typing import NamedTuple
 
@@ -24,10 +24,10 @@ class Located(NamedTuple):
 
 
 def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...]:
-    """Fit free curves of stiffness and damping to the force, and test every part by itself.
+    """Fit free curves of stiffness and damping to the force, and test the significance of each.
 
-    Where sizes alone are compared, states off resonance determine the stiffness and those near it
-    the damping, to first order: a part that the other one can explain as well is not reported.
+    Where only magnitudes are compared, states off resonance determine the stiffness and those near
+    it the damping, to first order: a part that the other one can explain is not reported.
     """
     noise, states = misfit.noise, misfit.predictions.states
     speed = np.abs(states.velocity[:, 0])
@@ -44,22 +44,22 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
     alone = [_fitted(left, sensitivities)[0] for sensitivities in curves]
     free, values, spread = _fitted(left, np.concatenate(curves, axis=1))
     n_force = int(of_force.sum())
-    if misfit.predictions.sizes.alone.any():  # they are not linear in a curve
+    if misfit.predictions.magnitudes.alone.any():  # not linear in the curves
         spread = spread * max(free / max(n_force - 2 * _FREE, 1), 1.0)
     parts = []
     for k, name in enumerate(("stiffness", "damping")):
         p_value = chi_square_p_value(alone[1 - k] - free, _FREE)
         if p_value < priors.REJECTED:
             some = slice(k * _FREE, (k + 1) * _FREE)
-            curve, its = values[some], spread[some, some]
-            std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, its, hats), 0.0))
+            curve, own = values[some], spread[some, some]
+            std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, own, hats), 0.0))
             ends = _range(speed, np.abs(hats @ curve) > 2 * std)
-            parts.append(Located(name, ends, p_value, *power_of_amplitude(knots, curve, its)))
-    chance = chi_square_p_value(free, n_force - 2 * _FREE)
-    if chance < priors.REJECTED and float(left @ left) > n_force:
-        parts.append(Located("not_a_function_of_amplitude", _range(speed), chance))
-    for place, order in enumerate(misfit.predictions.chosen.orders):
-        first = 2 * (states.velocity.shape[1] + place)
+            parts.append(Located(name, ends, p_value, *power_of_amplitude(knots, curve, own)))
+    p_value = chi_square_p_value(free, n_force - 2 * _FREE)
+    if p_value < priors.REJECTED and float(left @ left) > n_force:
+        parts.append(Located("not_a_function_of_amplitude", _range(speed), p_value))
+    for index, order in enumerate(misfit.predictions.chosen.orders):
+        first = 2 * (states.velocity.shape[1] + index)
         rows = (noise.column == first) | (noise.column == first + 1)
         if order not in (2, 3) or not rows.any():
             continue
@@ -72,21 +72,21 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
     return tuple(parts)
 
 
-def _range(speed: np.ndarray, seen: np.ndarray | None = None) -> tuple[float, float]:
-    """The range of velocities where something is seen; of all where it is seen nowhere."""
-    where = speed if seen is None or not seen.any() else speed[seen]
+def _range(speed: np.ndarray, visible: np.ndarray | None = None) -> tuple[float, float]:
+    """The velocity range of the `visible` states; of all states if there are none."""
+    where = speed if visible is None or not visible.any() else speed[visible]
     return float(where.min()), float(where.max())
 
 
 def _fitted(
     left: Float[np.ndarray, " row"], sensitivities: Float[np.ndarray, "row column"]
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """χ², the most likely values of some columns, and their covariance."""
-    scaled, size = unit_columns(sensitivities)
+    """χ², least-squares values of some columns, and their covariance."""
+    scaled, norm = unit_columns(sensitivities)
     inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-10, hermitian=True)
     values = -inverse @ (scaled.T @ left)
     left = left + scaled @ values
-    return float(left @ left), values / size, inverse / np.outer(size, size)
+    return float(left @ left), values / norm, inverse / np.outer(norm, norm)
 
 
 def power_of_amplitude(
@@ -94,20 +94,20 @@ def power_of_amplitude(
 ) -> tuple[float | None, float | None]:
     """The power of amplitude that a free curve follows, and 1σ; None where it follows none.
 
-    Least squares on the curve with its full covariance: uncertainty of the linear parameters
-    moves every amplitude alike, and changes that are not significant by themselves are kept.
+    Least squares on the curve with own full covariance: errors of the linear parameters are common
+    to all amplitudes, and individually insignificant changes are kept.
     """
     step = 0.01
     powers = np.arange(-4.0, 8.0, step)
-    # Straight pieces miss a power by a fiftieth of the change.
-    straight = (0.02 * values) ** 2 + 1e-12 * np.trace(covariance)
-    caveat = covariance + np.diag(straight)
-    root = np.linalg.inv(np.linalg.cholesky(caveat))
+    # Piecewise linear curves deviate from a power by a fiftieth of the change.
+    interpolation = (0.02 * values) ** 2 + 1e-12 * np.trace(covariance)
+    total = covariance + np.diag(interpolation)
+    root = np.linalg.inv(np.linalg.cholesky(total))
     curve, shapes = root @ values, root @ np.exp(np.outer(logarithm, powers))
     explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
     best = int(np.argmax(explained))
     left = float(curve @ curve - explained[best])
-    if explained[best] < priors.TELLING or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
+    if explained[best] < priors.SEEN_POWER or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
         return None, None
     below = np.flatnonzero(explained > explained[best] - 1.0)
     if below[0] == 0 or below[-1] == len(powers) - 1:

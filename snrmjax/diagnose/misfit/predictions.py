@@ -1,7 +1,7 @@
-"""The force and the harmonics that measured motions need by a model with further effects.
+"""Force and harmonics for the measured motions, by a model with further effects.
 
-The structure has the effects of all candidates with zero strength, so that one compiled program
-serves them: a candidate is a vector of parameters.
+The structure has the effects of all candidates at zero strength, so that one compiled program
+serves all of them: a candidate is a vector of parameters.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit import programs
 from snrmjax.diagnose.misfit.candidates import candidate, motion_scales, parameter_labels
-from snrmjax.diagnose.misfit.noise_model import Sizes, sizes_of
+from snrmjax.diagnose.misfit.noise_model import Magnitudes, magnitudes_of
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
     ComparedColumns,
@@ -31,9 +31,9 @@ from snrmjax.model.parameters import parameter_values, stated_stds
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded
 
-_BLOCK = 64  # rows of a program: a state under one vector of parameters each
-_ROOM = 256  # states that programs have room for: few tests have more, which compile anew
-_DIRECTIONS = 8  # derivatives that a call gives, at most
+_BLOCK = 64  # rows of a program: a state with one vector of parameters each
+_ROOM = 256  # padded number of states; larger tests recompile
+_DIRECTIONS = 8  # most derivatives a call
 
 
 class Group(NamedTuple):
@@ -42,28 +42,28 @@ class Group(NamedTuple):
     model: Structure
     names: tuple[str, ...]
     values: Float[np.ndarray, " parameter"]
-    unit: Float[np.ndarray, " parameter"]  # a change that is clearly detectable, or smaller
-    is_strength: Bool[np.ndarray, " parameter"]  # the first of an added effect
-    is_shape: Bool[np.ndarray, " parameter"]  # another one of it
-    force: Int[np.ndarray, " parameter"]  # of the added forces, whose it is; −1: of none
+    unit: Float[np.ndarray, " parameter"]  # a clearly detectable change, or smaller
+    is_strength: Bool[np.ndarray, " parameter"]  # first parameter of an added effect
+    is_shape: Bool[np.ndarray, " parameter"]  # its other parameters
+    force: Int[np.ndarray, " parameter"]  # index of the added force of this parameter; −1: none
 
-    def places(self, names: Iterable[str]) -> Int[np.ndarray, " name"]:
-        """The places of some parameters."""
+    def indices(self, names: Iterable[str]) -> Int[np.ndarray, " name"]:
+        """Indices of some parameters."""
         return np.array([self.names.index(name) for name in names], dtype=int)
 
     def at(
         self, names: Sequence[str], values: Float[np.ndarray, "*trial name"]
     ) -> Float[np.ndarray, "*trial parameter"]:
-        """All parameters, of which some have other values."""
+        """All parameters, with new values of some."""
         whole = np.tile(self.values, (*values.shape[:-1], 1))
-        whole[..., self.places(names)] = values
+        whole[..., self.indices(names)] = values
         return whole
 
 
 class _Steps(NamedTuple):
-    """Directions of slopes: a parameter each, or errors of the states where there is none (−1)."""
+    """Directions of derivatives: a parameter each, or errors of the states (index −1)."""
 
-    place: Int[np.ndarray, " direction"]
+    parameter: Int[np.ndarray, " direction"]
     length: Float[np.ndarray, "trial direction"]
     by_error: Float[np.ndarray, "input direction"]
 
@@ -71,9 +71,9 @@ class _Steps(NamedTuple):
 class Predicted(NamedTuple):
     """Columns of all states for several trials, and their derivatives along given directions.
 
-    NaN where no motion was found. A column is the misfit of the force over the measured force, or
-    of a harmonic over the measured velocity: real and imaginary parts, or the size and zero where
-    the phase is unknown. The phasors are those of the model.
+    NaN without convergence. A column is the misfit of the force over the measured force, or of a
+    harmonic over the measured velocity: real and imaginary parts, or the magnitude and zero where
+    the phase is unknown. The phasors are the model's.
     """
 
     columns: Float[np.ndarray, "trial state column"]
@@ -86,42 +86,44 @@ class Predictions:
     """Predictions of one model for one set of data; `predictions_of` makes them."""
 
     model: Structure
-    given: Structure  # the same, with the errors of levels that were stated
+    given: Structure  # the same, with the level errors as stated
     chosen: ComparedColumns
-    sizes: Sizes
-    states: CalibrationStates  # with room for harmonics that were not measured
+    magnitudes: Magnitudes
+    states: CalibrationStates  # padded with harmonics that were not measured
     compared: programs.ComparedMotion
-    own_columns: Int[np.ndarray, " column"]  # those of `states` that the data have
+    own_columns: Int[np.ndarray, " column"]  # measured columns of `states`
     level_numbers: Int[np.ndarray, " state"]
     force_gain_std: float
     stated: dict[str, tuple[float, float]]  # the baseline's uncertain parameters: value and 1σ
     group: Group
     motions: programs.Stored
-    added: Float[np.ndarray, "state input"]  # to logarithms of velocities and phases as recorded
-    reference: Any = None  # `misfit.reference.Reference`, once it is known
-    level_sizes: tuple[float, ...] = (0.0,) * 4  # 1σ of `LEVEL_ERRORS` that the noise takes
-    unstated_levels: tuple[bool, ...] = (False,) * 4  # which of them nobody stated
-    # What is added to the columns for that: errors that the records were corrected for still count.
+    added: Float[np.ndarray, "state input"]  # corrections to recorded log velocities and phases
+    reference: Any = None  # `misfit.reference.Reference`, once known
+    level_error_std: tuple[float, ...] = (0.0,) * 4  # estimated 1σ of `LEVEL_ERRORS`
+    unstated_levels: tuple[bool, ...] = (False,) * 4  # which of them were not stated
+    # Change of the columns back to the uncorrected records: corrected errors still count.
     offset: Float[np.ndarray, "state column"] | None = None
-    error_scale: float = 1.0  # of errors over those that were stated or assumed
+    error_scale: float = 1.0  # of errors over the stated or assumed ones
 
     @property
     def n_baseline_errors(self) -> int:
-        """How many shared errors are the baseline's: they come first, then those of levels."""
+        """Number of shared errors of the baseline: they come first, then those of levels."""
         return len(self.stated) + (self.force_gain_std > 0)
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The effects that candidates may have."""
+        """The effects available to candidates."""
         added = self.group.model.effects[len(self.model.effects) :]
         return tuple(effect.kind for effect in added)
 
     def with_kinds(self, kinds: Iterable[str]) -> "Predictions":
-        """The same for candidates of some kinds of effects."""
+        """The predictions for candidates of some kinds of effects."""
         return dataclasses.replace(self, group=_with_effects(self.model, scales_of(self), kinds))
 
-    def carried_back(self, by_error: Float[np.ndarray, "state column input"]) -> "Predictions":
-        """The same as the records have it, by what errors do to the columns."""
+    def referred_to_records(
+        self, by_error: Float[np.ndarray, "state column input"]
+    ) -> "Predictions":
+        """The predictions referred to the uncorrected records, by first-order error propagation."""
         offset = -np.einsum("sci,si->sc", by_error, self.added)
         return dataclasses.replace(self, offset=offset)
 
@@ -131,9 +133,9 @@ class Predictions:
         added: Float[np.ndarray, "state input"],
         harmonics: int | None = None,
     ) -> "Predictions":
-        """The same of records to which something was added; it counts once they are weighted.
+        """The predictions at records with `added` corrections; the offset follows with weighting.
 
-        Arguments: `data` as they were measured; `harmonics` of the motions, as before if None.
+        Arguments: `data`: as measured; `harmonics`: of the motions, as before if None.
         """
         order = self.compared.harmonic_order if harmonics is None else harmonics
         corrected = with_corrected_records(data, self.chosen.rows, self.chosen.sensors, added)
@@ -141,137 +143,145 @@ class Predictions:
         return dataclasses.replace(self, **records, added=added)
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
-        """The same with all errors of force, velocities and phases so many times larger."""
+        """The predictions with all errors of force, velocities and phases scaled."""
         states = self.chosen.states
         scaled = self.chosen._replace(states=states._replace(error=factor * states.error))
         return dataclasses.replace(self, chosen=scaled, error_scale=factor * self.error_scale)
 
     def with_phases(self, phase: Float[np.ndarray, " state"]) -> "Predictions":
-        """The same with velocities of unknown phase at these phases, rad."""
+        """The predictions with unknown phases of velocities set to these, rad."""
         states, unknown = self.chosen.states, self.chosen.phase_unknown[:, :1]
-        turn = np.where(unknown, np.exp(1j * phase)[:, None], 1.0)
-        turned = self.chosen._replace(states=states._replace(velocity=states.velocity * turn))
-        return dataclasses.replace(self, chosen=turned)
+        rotation = np.where(unknown, np.exp(1j * phase)[:, None], 1.0)
+        rotated = self.chosen._replace(states=states._replace(velocity=states.velocity * rotation))
+        return dataclasses.replace(self, chosen=rotated)
 
     def whitened_for(
         self,
         by_error: Float[np.ndarray, "state column input"],
         phasors: Complex[np.ndarray, "state part"],
     ) -> tuple[Float[np.ndarray, "state column column"], Bool[np.ndarray, "state column"]]:
-        """The whitening of the states by a model with these phasors that passes on errors so.
-
-        And which columns count.
-        """
+        """Whitening of the states and used columns, for a model's phasors and errors."""
         chosen = self.chosen
-        if self.sizes.alone.any():
-            std = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
+        if self.magnitudes.alone.any():
+            std = self.magnitudes.own_std(np.asarray(chosen.states.own_std), phasors)
             chosen = chosen._replace(states=chosen.states._replace(own_std=jnp.asarray(std)))
         parts = [padded(np.asarray(part), _ROOM) for part in (*chosen.states, by_error)]
         *columns, errors = jax.device_put(parts)
-        found = state_whitener(CalibrationStates(*columns), errors, jnp.zeros(()))
-        whiten = np.asarray(found)[: len(by_error)]
+        whitener = state_whitener(CalibrationStates(*columns), errors, jnp.zeros(()))
+        whiten = np.asarray(whitener)[: len(by_error)]
         used = np.any(whiten != 0, axis=(1, 2))
         return whiten, np.asarray(chosen.states.known) & used[:, None]
 
     def of(
         self, values: Float[np.ndarray, "trial parameter"], along: Sequence[str] = ()
     ) -> Predicted:
-        """The misfit of the states for every trial's parameters, and slopes along some of these."""
-        group, places = self.group, self.group.places(along)
-        # Slopes are differences, over a small share of a change that is clearly detectable. The
-        # unit of a shape may be a guess: its own size counts, unless that is zero.
-        size = np.abs(values)
-        length = np.maximum(group.unit, np.where(group.is_strength, size, 0.0))
-        shape_length = np.clip(size, 1e-6 * group.unit, group.unit)
-        length = np.where(group.is_shape & (size > 0), shape_length, length)[:, places]
-        steps = _Steps(places, length, np.zeros((self.states.error.shape[1], len(places))))
-        columns, slopes = self._in_turn(values, steps)
+        """The misfit of the states for each trial's parameters, and derivatives by some."""
+        group, indices = self.group, self.group.indices(along)
+        # Finite differences over a small fraction of a clearly detectable change. The unit of a
+        # shape may be a guess: its own magnitude is used unless zero.
+        magnitude = np.abs(values)
+        length = np.maximum(group.unit, np.where(group.is_strength, magnitude, 0.0))
+        shape_length = np.clip(magnitude, 1e-6 * group.unit, group.unit)
+        length = np.where(group.is_shape & (magnitude > 0), shape_length, length)[:, indices]
+        steps = _Steps(indices, length, np.zeros((self.states.error.shape[1], len(indices))))
+        columns, slopes = self._by_batches(values, steps)
         slopes = slopes / length[:, None, None]
         if self.offset is not None:
             columns = columns + self.offset
-        compared = self.sizes.compared(columns, slopes)
-        return Predicted(*compared, self.sizes.phasors(columns))
+        compared = self.magnitudes.compared(columns, slopes)
+        return Predicted(*compared, self.magnitudes.phasors(columns))
 
     def by_error(
         self, values: Float[np.ndarray, " parameter"]
     ) -> tuple[Float[np.ndarray, "state column input"], Complex[np.ndarray, "state part"]]:
-        """Derivatives by the states' errors, as a model with these parameters passes them on.
+        """Derivatives by the states' errors, propagated through a model with these parameters.
 
-        A gain or a phase acts on what the model has there and not on what was measured, whose noise
-        levels of free gain would else explain (D'Agostini, doi:10.1016/0168-9002(94)90719-6).
-        Returns the model's phasors too.
+        Gain and phase errors act on the model's prediction, not on the measured value: otherwise
+        free level gains would fit the noise (D'Agostini, doi:10.1016/0168-9002(94)90719-6).
+        Also returns the model's phasors.
         """
         inputs, unit = self.states.error.shape[1], 0.1  # of a logarithm, or rad
         steps = _Steps(np.full(inputs, -1), np.zeros((1, inputs)), unit * np.eye(inputs))
-        columns, slopes = self._in_turn(values[None], steps)
-        slopes = slopes / unit - self._by_error_of_missed(columns)
-        found = self.sizes.compared(columns, slopes, of_errors=True)[1]
-        return found[0], self.sizes.phasors(columns)[0]
+        columns, slopes = self._by_batches(values[None], steps)
+        slopes = slopes / unit - self._by_error_of_residual(columns)
+        derivatives = self.magnitudes.compared(columns, slopes, of_errors=True)[1]
+        return derivatives[0], self.magnitudes.phasors(columns)[0]
 
-    def _by_error_of_missed(
+    def _by_error_of_residual(
         self, columns: Float[np.ndarray, "trial state column"]
     ) -> Float[np.ndarray, "trial state column input"]:
-        """What gains and phases do to the difference of the model from other sensors and harmonics.
+        """Derivatives of the misfit of other sensors and harmonics by gains and phases.
 
-        Both act on a sensor's motion; a phase turns harmonic h by h times as much.
+        Both act on a sensor's motion; a phase error φ rotates harmonic h by hφ.
         """
         orders, n = self.chosen.orders, len(self.chosen.sensors)
         sensor = [*range(1, n), *np.repeat(np.arange(n), len(orders))]
         order = [*[1] * (n - 1), *orders * n]
-        found = np.zeros((*columns.shape, 1 + 2 * n))
+        derivatives = np.zeros((*columns.shape, 1 + 2 * n))
         for k, (s, h) in enumerate(zip(sensor, order, strict=True), 1):
-            missed = columns[..., 2 * k] + 1j * columns[..., 2 * k + 1]
-            for place, by in ((1 + s, missed), (1 + n + s, 1j * h * missed)):
-                found[..., 2 * k, place], found[..., 2 * k + 1, place] = by.real, by.imag
-        return found
+            residual = columns[..., 2 * k] + 1j * columns[..., 2 * k + 1]
+            for index, by in ((1 + s, residual), (1 + n + s, 1j * h * residual)):
+                derivatives[..., 2 * k, index], derivatives[..., 2 * k + 1, index] = (
+                    by.real,
+                    by.imag,
+                )
+        return derivatives
 
-    def _in_turn(
+    def _by_batches(
         self, values: Float[np.ndarray, "trial parameter"], steps: "_Steps"
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns, and slopes along some directions after the other."""
-        wanted, parts = len(steps.place), []
+        """Columns and derivatives, by batches of directions."""
+        wanted, parts = len(steps.parameter), []
         for begin in range(0, max(wanted, 1), _DIRECTIONS):
             some = [a[..., begin : begin + _DIRECTIONS] for a in steps]
             room = [(0, _DIRECTIONS - some[0].size)]
             filled = _Steps(*(np.pad(a, [(0, 0)] * (a.ndim - 1) + room) for a in some))
-            parts.append(self._answers(values, filled, min(wanted - begin, _DIRECTIONS)))
+            parts.append(self._evaluated(values, filled, min(wanted - begin, _DIRECTIONS)))
         return parts[0][0], np.concatenate([slope for _, slope in parts], axis=3)[..., :wanted]
 
-    def _answers(
+    def _evaluated(
         self, values: Float[np.ndarray, "trial parameter"], steps: "_Steps", wanted: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and slopes: friction by quick formulas, over the whole cycle where they fail."""
+        """Columns and derivatives; friction by quick formulas or, where these fail, in full."""
         group = self.group
         used = np.any(values != group.values, axis=0)
-        used[steps.place[:wanted][steps.place[:wanted] >= 0]] = True
+        used[steps.parameter[:wanted][steps.parameter[:wanted] >= 0]] = True
         active = np.zeros(group.force.max() + 1, dtype=bool)
         active[group.force[used & (group.force >= 0)]] = True
         n, trials = len(self.chosen.rows), len(values)
         state, trial = np.tile(np.arange(n), trials), np.repeat(np.arange(trials), n)
 
-        def answered(quick: bool, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        def evaluated(quick: bool, rows: np.ndarray) -> tuple[np.ndarray, ...]:
             def block(some: np.ndarray) -> list[np.ndarray]:
                 at = padded(some, _BLOCK)
                 first = int(trial[some[0]])
-                near = slice(first, first + _BLOCK)  # no more trials meet in a block
+                near = slice(first, first + _BLOCK)  # a block has no more trials than rows
                 ours = [padded(a[near], _BLOCK) for a in (values, steps.length)]
-                asked: list[Any] = [*ours, steps.place, steps.by_error, active, np.array(wanted)]
-                asked += [state[at], trial[at] - first]
+                arrays: list[Any] = [
+                    *ours,
+                    steps.parameter,
+                    steps.by_error,
+                    active,
+                    np.array(wanted),
+                ]
+                arrays += [state[at], trial[at] - first]
                 how = programs.Settings(group.names, self.compared, len(self.model.effects), quick)
-                found = programs.missed(group.model, how, self.motions, programs.Asked(*asked))
-                return [np.asarray(a)[: len(some), self.own_columns] for a in found]
+                output = programs.misfit_columns(
+                    group.model, how, self.motions, programs.Trials(*arrays)
+                )
+                return [np.asarray(a)[: len(some), self.own_columns] for a in output]
 
             blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
             parts = over_cores(block, blocks)
             return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
-        found = answered(True, np.arange(n * trials))
-        good = [np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in found]
+        results = evaluated(True, np.arange(n * trials))
+        good = [np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in results]
         left = np.flatnonzero(~(good[0] & good[1]))
         if left.size and any(_has_quick_formula(group.names[k]) for k in np.flatnonzero(used)):
-            for part, own in zip(found, answered(False, left), strict=True):
+            for part, own in zip(results, evaluated(False, left), strict=True):
                 part[left] = own
-        columns, slopes = (a.reshape(trials, n, *a.shape[1:]) for a in found)
+        columns, slopes = (a.reshape(trials, n, *a.shape[1:]) for a in results)
         return columns, slopes
 
 
@@ -283,13 +293,13 @@ def predictions_of(
     harmonics: int = programs.HARMONICS,
     kinds: Iterable[str] | None = None,
 ) -> Predictions:
-    """Predictions of a model for measured states, ready to be evaluated.
+    """Predictions of a model for measured states, with the baseline's motions solved.
 
-    The baseline's motions are found here. `force_gain_std` is the relative 1σ of a gain that all
-    forces share; `harmonics` are those of the motions; `kinds` the effects that candidates may
-    have, all that are known if None: their programs are the larger, the more they are.
+    `force_gain_std`: relative 1σ of a gain common to all forces; `harmonics`: number of those of
+    the motions; `kinds`: effects available to candidates, all known ones if None: the compiled
+    programs grow with their number.
     """
-    model = dataclasses.replace(model, name="")  # its name would be a part of the programs
+    model = dataclasses.replace(model, name="")  # the name would be static in the compiled programs
     records = _records(model, data, harmonics)
     numbers = parameter_values(model)
     return Predictions(
@@ -312,13 +322,13 @@ def predictions_of(
 def _records(
     model: Structure, data: SteadyStates, harmonics: int, error_scale: float = 1.0
 ) -> dict[str, Any]:
-    """What of `Predictions` depends on the records, with the baseline's motions at them."""
+    """The fields of `Predictions` that depend on the records, with the baseline's motions."""
     chosen = calibration_states(model, data, programs.HARMONICS)
-    # Operations of JAX compile for every number of states.
+    # On the host: JAX operations recompile for every number of states.
     on_host: Any = jax.tree.map(np.asarray, chosen.states)
     error = on_host.error
-    # A force errs by a share of the velocity's error where none is stated: beside a steep curve an
-    # error of amplitude shows itself in the frequency, and the damping would be exact.
+    # An unstated force error is a fraction of the velocity's: on a steep curve amplitude errors
+    # act on the frequency, and without a force error the damping would be exact.
     force = np.where(error[:, :1] > 0, error[:, :1], FORCE_TO_VELOCITY * error[:, 1:2])
     error = error_scale * np.concatenate([force, error[:, 1:]], axis=1)
     chosen = chosen._replace(states=on_host._replace(error=error))
@@ -328,12 +338,12 @@ def _records(
     def motions(*rows: Array) -> tuple[Array, Array]:
         return programs.grown(model, CalibrationStates(*rows), compared)
 
-    found = by_blocks(motions, 16, *columns)  # grown one after the other
-    arrays = jax.device_put([padded(rows, _ROOM) for rows in (*columns, *found)])
+    solved = by_blocks(motions, 16, *columns)  # by continuation in amplitude
+    arrays = jax.device_put([padded(rows, _ROOM) for rows in (*columns, *solved)])
     every: list[Any] = columns
     return {
         "chosen": chosen,
-        "sizes": sizes_of(chosen),
+        "magnitudes": magnitudes_of(chosen),
         "states": CalibrationStates(*every),
         "compared": compared,
         "own_columns": own_columns,
@@ -342,9 +352,9 @@ def _records(
 
 
 def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:
-    """1σ of the participation by the stated one of the modal mass 1/(Φ_r Φᵀb).
+    """1σ of the participation from the stated one of the modal mass 1/(Φ_r Φᵀb).
 
-    Beside a gain of all forces that is free the modal mass is one with it, and so the model's.
+    None with a free force gain, which the modal mass cannot be separated from.
     """
     modes, j = model.modes, model.modes.mode_of_interest
     if modes.modal_mass_std is None or force_gain_std > 0:
@@ -354,7 +364,7 @@ def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:
 
 
 def _with_effects(baseline: Structure, scales: MotionScales, kinds: Iterable[str]) -> Group:
-    """The structure with some kinds of effects that the baseline does not have."""
+    """The structure with effects of some kinds that the baseline lacks."""
     present = [effect.kind for effect in baseline.effects]
     model = with_idle_effects(baseline, [kind for kind in kinds if kind not in present])
     added = model.effects[len(present) :]
@@ -369,14 +379,14 @@ def _with_effects(baseline: Structure, scales: MotionScales, kinds: Iterable[str
     where = {name: k for k, name in enumerate(names)}
     is_strength, is_shape = np.zeros((2, len(names)), dtype=bool)
     for effect in added:
-        places = [where[label] for label in parameter_labels(effect.kind)]
-        unit[places] = candidate(effect.kind, scales).unit
-        is_strength[places[0]], is_shape[places[1:]] = True, True
+        indices = [where[label] for label in parameter_labels(effect.kind)]
+        unit[indices] = candidate(effect.kind, scales).unit
+        is_strength[indices[0]], is_shape[indices[1:]] = True, True
     return Group(model, names, values, unit, is_strength, is_shape, force)
 
 
 def with_idle_effects(model: Structure, kinds: Sequence[str]) -> Structure:
-    """The model with further effects that have no strength: the same physics."""
+    """The model with further effects at zero strength: the same physics."""
     modes, j = model.modes, model.modes.mode_of_interest
     mode = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
     added = tuple(EFFECTS[kind].without_strength(*mode) for kind in kinds)
@@ -384,27 +394,26 @@ def with_idle_effects(model: Structure, kinds: Sequence[str]) -> Structure:
 
 
 def _has_quick_formula(name: str) -> bool:
-    """Whether a parameter is one of an effect that has a quick formula."""
+    """Whether a parameter belongs to an effect with a quick formula."""
     effect = EFFECTS.get(name.split(".")[0])
     return effect is not None and issubclass(effect, AbstractForce) and effect.has_quick_formula()
 
 
 def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:
-    """The states as the programs take them, their harmonics, and which columns are the states' own.
+    """States with padded harmonics for the programs, these orders, and the measured columns.
 
-    Harmonics that the states lack have room: the states of a further test have them, and one
-    program answers for both.
+    States of a further test may have harmonics that the measured ones lack: one program for both.
     """
     n, n_sensors = chosen.states.velocity.shape
     orders = tuple(sorted({*programs.COMPARED, *chosen.orders}))
-    places = np.array([orders.index(h) for h in chosen.orders], dtype=int)
+    indices = np.array([orders.index(h) for h in chosen.orders], dtype=int)
     harmonics = np.zeros((n, n_sensors, len(orders)), dtype=complex)
-    harmonics[:, :, places] = chosen.states.harmonics
+    harmonics[:, :, indices] = chosen.states.harmonics
     first = n_sensors + len(orders) * np.arange(n_sensors)[:, None]
-    phasors = np.append(np.arange(n_sensors), first + places)
+    phasors = np.append(np.arange(n_sensors), first + indices)
     columns = (2 * phasors[:, None] + np.arange(2)).reshape(-1)
     wide = np.zeros((2, n, 2 * n_sensors * (1 + len(orders))))
-    # Of a phasor whose size alone counts the programs give both parts.
+    # Programs return both parts, also of phasors compared by magnitude.
     known = np.asarray(chosen.states.known)[:, ::2]
     wide[:, :, columns] = chosen.states.own_std, np.repeat(known, 2, axis=1)
     widened = {"harmonics": harmonics, "own_std": wide[0], "known": wide[1] > 0}
@@ -413,7 +422,7 @@ def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...]
 
 
 def scales_of(predictions: Predictions) -> MotionScales:
-    """Typical sizes of the measured motions."""
+    """Typical magnitudes of the measured motions."""
     return motion_scales(predictions.model, predictions.chosen)
 
 
@@ -423,19 +432,19 @@ def with_corrected_records(
     sensors: tuple[int, ...],
     added: Float[np.ndarray, "state input"],
 ) -> SteadyStates:
-    """The data with errors of velocities and phases taken away, of the states in `rows`."""
+    """The data with log velocities and phases corrected by `added` for the states in `rows`."""
     plain: Any = jax.tree.map(np.asarray, data)
     n = len(sensors)
-    size, turn = np.ones((data.n_states, n)), np.zeros((data.n_states, n))
-    size[rows], turn[rows] = np.exp(added[:, 1 : n + 1]), added[:, n + 1 :]
+    factor, rotation = np.ones((data.n_states, n)), np.zeros((data.n_states, n))
+    factor[rows], rotation[rows] = np.exp(added[:, 1 : n + 1]), added[:, n + 1 :]
     back = np.argsort(sensors)
-    size, turn = size[:, back], turn[:, back]
+    factor, rotation = factor[:, back], rotation[:, back]
     orders = np.array(data.harmonic_order, dtype=int)
-    found: SteadyStates = dataclasses.replace(
+    corrected: SteadyStates = dataclasses.replace(
         plain,
-        velocity=plain.velocity * (size * np.exp(1j * turn)),
-        velocity_std=plain.velocity_std * size,
-        harmonics=plain.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
-        harmonic_std=plain.harmonic_std * size,
+        velocity=plain.velocity * (factor * np.exp(1j * rotation)),
+        velocity_std=plain.velocity_std * factor,
+        harmonics=plain.harmonics * factor[:, :, None] * np.exp(1j * rotation[:, :, None] * orders),
+        harmonic_std=plain.harmonic_std * factor,
     )
-    return found
+    return corrected

@@ -1,8 +1,8 @@
-"""The compiled programs behind predictions: rows of states, each with parameters of its own.
+"""The compiled programs behind predictions: rows of states, each with its own parameters.
 
-A motion with a trial's parameters is reached from the baseline's by steps with the baseline's
-Jacobian, for many rows at once. One program serves all effects: those with zero strength are
-skipped.
+The motion for a trial's parameters is solved from the baseline's by secant steps with the
+baseline's Jacobian, for many rows at once. One program serves all effects: those with zero strength
+are skipped.
 """
 
 import dataclasses
@@ -34,17 +34,17 @@ from snrmjax.simulate.balance.harmonics import displacement_phasors, harmonic_ba
 from snrmjax.simulate.balance.prescribed_motion import Secants, batched_zero, start_of
 
 HARMONICS = 5
-"""Of the motions: three that are compared, and two more that influence those."""
+"""Harmonics of the motions: three are compared, two more influence those."""
 
 
 COMPARED = (2, 3)
-"""Harmonics that the programs hold, measured or not."""
+"""Higher harmonics in the programs, measured or not."""
 
-_STEP = 2.5e-4  # of a direction, between the two ends of a slope
+_STEP = 2.5e-4  # finite difference, in units of a direction's length
 
 
 class ComparedMotion(NamedTuple):
-    """What of a motion is compared with the measured one, and with how many harmonics it moves."""
+    """Compared sensors and orders of a motion, and its number of harmonics."""
 
     sensors: tuple[int, ...]  # the reference first
     orders: tuple[int, ...]  # of the harmonics that are compared
@@ -55,7 +55,7 @@ class ComparedMotion(NamedTuple):
 def grown(
     model: Structure, states: CalibrationStates, compared: ComparedMotion
 ) -> tuple[Float[Array, "row entry"], Float[Array, "row entry entry"]]:
-    """Motions grown from small amplitudes, NaN where none was found, and inverse Jacobians."""
+    """Motions by continuation from small amplitudes (NaN where it fails), and inverse Jacobians."""
 
     def one(*row: Array) -> tuple[Array, Array]:
         state = CalibrationStates(*row)
@@ -69,102 +69,104 @@ def grown(
 
 
 class Stored(NamedTuple):
-    """States, baseline motions and inverse Jacobians there; a row for every state, and spare."""
+    """States, baseline motions and their inverse Jacobians, padded."""
 
     states: CalibrationStates
     near: Float[Array, "state entry"]
     inverse: Float[Array, "state entry entry"]
 
 
-class Asked(NamedTuple):
-    """Rows of states under trials' parameters, and the directions of their slopes."""
+class Trials(NamedTuple):
+    """Rows of states with trials' parameters, and the directions of derivatives."""
 
     values: Float[Array, "trial parameter"]
-    length: Float[Array, "trial direction"]  # of a slope's step: of one parameter, or of errors
-    place: Int[Array, " direction"]  # of the parameter
+    length: Float[Array, "trial direction"]  # unit of a direction: of a parameter, or of errors
+    parameter: Int[Array, " direction"]  # index of the parameter; −1: errors
     by_error: Float[Array, "input direction"]
-    active: Bool[Array, " force"]  # which of the added `forces_of` have strength
-    n_directions: Int[Array, ""]  # of the directions, that have slopes
+    active: Bool[Array, " force"]  # which of the added `forces_of` have nonzero strength
+    n_directions: Int[Array, ""]  # number of used directions
     state: Int[Array, " row"]
     trial: Int[Array, " row"]
 
 
 class Settings(NamedTuple):
-    """What is compiled into a program beside the structure."""
+    """Static settings of a program, in addition to the structure."""
 
     names: tuple[str, ...]  # of all parameters of the structure
     compared: ComparedMotion
-    n_given: int  # how many effects are the baseline's: the first ones
-    quick: bool  # whether friction is taken by formulas for cycles that turn only twice
+    n_given: int  # number of the baseline's effects, which come first
+    quick: bool  # whether friction uses formulas for cycles with only two turning points
 
 
 @compiled
-def missed(
+def misfit_columns(
     model: Structure,
     settings: Settings,
     stored: Stored,
-    asked: Asked,
+    trials: Trials,
 ) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
-    """The misfit of every row, and its slopes along the wanted directions, else zero.
+    """The misfit of every row, and its derivatives along the used directions, else zero.
 
-    NaN where no motion was found, and with `quick` formulas for cycles to which they do not apply.
-    Slopes are differences between motions a small step apart: the second is a step or two from
-    the first, and the equations are compiled only once.
+    NaN without convergence, and with `quick` formulas for cycles to which they do not apply.
+    Derivatives are finite differences of motions: the second is solved in a step or two from the
+    first, and the equations are compiled only once.
     """
     names, compared, n_given, quick = settings
-    n_directions, n_wanted = len(asked.place), asked.n_directions
-    close = jnp.where(n_wanted > 0, 1e-8, 1e-5)  # the last step of a motion's solution
+    n_directions, n_wanted = len(trials.parameter), trials.n_directions
+    close = jnp.where(n_wanted > 0, 1e-8, 1e-5)  # tolerance of the last step
 
     def one(state: Array, trial: Array) -> tuple[Array, Array]:
         measured, near, inverse = jax.tree.map(lambda a: a[state], stored)
-        values, length = asked.values[trial], asked.length[trial]
+        values, length = trials.values[trial], trials.length[trial]
 
-        def found(
+        def solved(
             number: Array, start: Secants, columns: Float[Array, "column direction"]
         ) -> tuple[Secants, Float[Array, "column direction"]]:
             along = jnp.where(jnp.arange(n_directions) == number - 1, _STEP, 0.0)
-            is_parameter = asked.place[number - 1] == jnp.arange(len(names))
+            is_parameter = trials.parameter[number - 1] == jnp.arange(len(names))
             changed = with_parameters(model, names, values + (length @ along) * is_parameter)
             added = changed.effects[n_given:]
             order = compared.harmonic_order
             forces = [_quick(added[k], order, quick=quick) for k in forces_of(added)]
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
             changed = dataclasses.replace(changed, effects=(*changed.effects[:n_given], *rest))
-            erring = StateWithErrors(measured, 1.0, asked.by_error @ along)
-            motion = erring.motion(changed, compared.sensors[0], compared.harmonic_order)
+            perturbed = StateWithErrors(measured, 1.0, trials.by_error @ along)
+            motion = perturbed.motion(changed, compared.sensors[0], compared.harmonic_order)
             parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
-            balance = _ForcedBalance(**parts, forces=tuple(forces), active=asked.active)
+            balance = _ForcedBalance(**parts, forces=tuple(forces), active=trials.active)
             motion = dataclasses.replace(motion, balance=balance)
-            fraction = jnp.where(number > 0, 1e-2, 0.0)  # of a slope's first step: the last one
+            fraction = jnp.where(number > 0, 1e-2, 0.0)  # tolerance relative to the first step
             end = motion.solved_by_secants(inverse, start, close, fraction)
-            # Where the second motion is not found, the first step towards it is its slope.
+            # Without convergence of the second motion, use its first step.
             lost = (number > 0) & ~jnp.all(jnp.isfinite(end.point))
             point = jnp.where(lost, start.point + end.moves[0], end.point)
-            own_columns = residual_columns(erring, motion, point, compared.sensors, compared.orders)
+            own_columns = residual_columns(
+                perturbed, motion, point, compared.sensors, compared.orders
+            )
             start = jax.tree.map(lambda a, b: jnp.where(number == 0, a, b), end, start)
-            place = jnp.arange(n_directions + 1) == number
-            return start, jnp.where(place, own_columns[:, None], columns)
+            used = jnp.arange(n_directions + 1) == number
+            return start, jnp.where(used, own_columns[:, None], columns)
 
         none = batched_zero(near) + jnp.zeros((measured.known.shape[0], n_directions + 1))
         columns = jax.lax.fori_loop(
-            0, n_wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
+            0, n_wanted + 1, lambda k, now: solved(k, *now), (start_of(near), none)
         )[1]
         change = columns[:, 1:] - columns[:, :1]
-        chance = 1e-9  # of a column, by which solutions may differ
-        seen = (jnp.arange(n_directions) < n_wanted) & ~(jnp.abs(change) < chance)
-        return columns[:, 0], jnp.where(seen, change / _STEP, 0.0)
+        tolerance = 1e-9  # change of a column within solver tolerance
+        significant = (jnp.arange(n_directions) < n_wanted) & ~(jnp.abs(change) < tolerance)
+        return columns[:, 0], jnp.where(significant, change / _STEP, 0.0)
 
-    return jax.vmap(one)(asked.state, asked.trial)
+    return jax.vmap(one)(trials.state, trials.trial)
 
 
 def forces_of(effects: Sequence[AbstractEffect]) -> list[int]:
-    """Which effects are taken as forces on the mode of interest."""
+    """Indices of effects that are forces on the mode of interest."""
     kinds = (AbstractForce, AbstractInternalResonance)
     return [k for k, effect in enumerate(effects) if isinstance(effect, kinds)]
 
 
 class _ForcedBalance(HarmonicBalance):
-    """A balance with further forces, each sampled as it needs; few of them count."""
+    """A harmonic balance with further forces, sampled as each needs; few are active."""
 
     forces: tuple[AbstractForce, ...] = ()
     active: Bool[Array, " force"] = eqx.field(default_factory=lambda: jnp.zeros(0, dtype=bool))
@@ -185,7 +187,7 @@ class _ForcedBalance(HarmonicBalance):
     def _harmonics(
         self, members: list[int], n_samples: int, x: Float[Array, " coefficient"], omega: Array
     ) -> Float[Array, " coefficient"]:
-        """Coefficients of some of the forces over the cycle of a mode's coefficients."""
+        """Fourier coefficients of some of the forces along the motion of a mode."""
         basis = harmonic_basis((self.n_coefficients - 1) // 2, n_samples)
         q = jnp.asarray(basis.synthesis) @ x
         v = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
@@ -196,14 +198,14 @@ class _ForcedBalance(HarmonicBalance):
 
 
 def _where(
-    counts: Bool[Array, ""], function: Callable[[Array, Array], Array], first: Array, second: Array
+    active: Bool[Array, ""], function: Callable[[Array, Array], Array], first: Array, second: Array
 ) -> Array:
-    """A function of two arrays of the first one's shape where it counts, else nothing."""
-    # A method of a module with arrays has no hash.
-    taken = jax.lax.cond(
-        counts, lambda a, b: function(a, b), lambda a, _: jnp.zeros_like(a), first, second
+    """A function of two arrays where `active`, else zeros of the first one's shape."""
+    # By lambda: a method of a module with arrays has no hash.
+    values = jax.lax.cond(
+        active, lambda a, b: function(a, b), lambda a, _: jnp.zeros_like(a), first, second
     )
-    return taken
+    return values
 
 
 def _samples(force: AbstractForce) -> int:
@@ -219,7 +221,7 @@ def _quick(effect: AbstractEffect, harmonics: int, *, quick: bool) -> AbstractFo
 
 
 class _Quick(AbstractForce):
-    """A force by its quick formula, which is NaN over cycles for which it does not hold."""
+    """A force by its quick formula, NaN for cycles where that does not hold."""
 
     kind: ClassVar[str] = "quick"
     effect: AbstractForce
@@ -231,7 +233,7 @@ class _Quick(AbstractForce):
 
 
 class _Resonance(AbstractForce):
-    """What a coupled mode in steady motion does to the mode of interest."""
+    """The force of a coupled mode in steady motion on the mode of interest."""
 
     kind: ClassVar[str] = "resonance"
     effect: AbstractInternalResonance
@@ -248,7 +250,7 @@ class _Resonance(AbstractForce):
         natural = 2 * jnp.pi * jnp.asarray(mode.frequency_hz)
         rate = jnp.arange(self.harmonics + 1) * omega
         stiffness = natural**2 - rate**2 + 2j * mode.damping_ratio * natural * rate
-        answer = -mode.coefficient * load / stiffness
-        parts = jnp.stack([answer.real, -answer.imag], axis=1).reshape(-1)
+        response = -mode.coefficient * load / stiffness
+        parts = jnp.stack([response.real, -response.imag], axis=1).reshape(-1)
         parts = jnp.concatenate([parts[:1], parts[2:]])  # the mean has no sine
         return n * mode.coefficient * q ** (n - 1) * (jnp.asarray(basis.synthesis) @ parts)

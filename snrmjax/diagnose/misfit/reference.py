@@ -1,9 +1,9 @@
-"""The measured states by themselves, without any law: how errors move them, and their sizes.
+"""Smooth curves through the measured states: error propagation and error levels without a law.
 
-The posterior of a test (`identify.test_model`) follows any smooth law. Its slopes weigh the misfit
-of every candidate alike, so that none is favoured by what it would pass on itself, and a model that
-lacks most of the stiffness does not take the weights from the data. Of a force that is known as a
-drive voltage it gives a first value of the gain.
+The posterior of a test (`identify.test_model`) follows any smooth law. Its slopes weight the misfit
+of all candidates alike: none is favoured by its own error propagation, and a model that lacks most
+of the stiffness does not distort the weights. For a force known as a drive voltage the posterior
+gives a first value of the gain.
 """
 
 import dataclasses
@@ -29,16 +29,16 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.facts import Fact
 
-_FEWEST = 6  # states with a phase
+_FEWEST = 6  # least number of states with a phase
 
 
 class Reference(NamedTuple):
-    """What smooth curves make of the states that have phases."""
+    """Smooth curves through the states with phases, and their error propagation."""
 
     posterior: TestPosterior
-    rows: np.ndarray  # of the compared states, that have a phase
-    by_velocity: Complex[np.ndarray, " state"]  # relative change of the needed force: of log |V|
-    by_phase: Complex[np.ndarray, " state"]  # of the phase
+    rows: np.ndarray  # compared states with a phase
+    by_velocity: Complex[np.ndarray, " state"]  # relative change of the required force by log |V|
+    by_phase: Complex[np.ndarray, " state"]  # likewise by phase
 
 
 def reference_of(predictions: Predictions) -> Reference | None:
@@ -48,32 +48,32 @@ def reference_of(predictions: Predictions) -> Reference | None:
     if len(rows) < _FEWEST:
         return None
     states = test_states_of(predictions, rows)
-    # The misfit weighs states by one relative noise: only where phases may have been controlled,
-    # whose scatter is the frequency's, is it taken apart.
-    found = fit_test(states, parts_of_noise=states.near_one_phase)
-    # What errors move belongs to the motion that was there: the records without any of them.
-    levels = found.level_errors[states.level]
-    errors = found.corrections[:, 1] - (0.0 if states.force_is_free else levels[:, 0])
-    turn = found.corrections[:, 2] - levels[:, 1] - found.instrument_phase
-    velocity = states.velocity * np.exp(errors + 1j * turn)
+    # The misfit has one relative noise; parts are only separated where phases may be controlled,
+    # since their scatter is then that of the frequency.
+    posterior = fit_test(states, parts_of_noise=states.near_one_phase)
+    # Evaluate slopes at the actual motion: the records less all estimated errors.
+    levels = posterior.level_errors[states.level]
+    errors = posterior.corrections[:, 1] - (0.0 if states.force_is_free else levels[:, 0])
+    rotation = posterior.corrections[:, 2] - levels[:, 1] - posterior.instrument_phase
+    velocity = states.velocity * np.exp(errors + 1j * rotation)
     omega = states.frequency
-    curves = found.curves(np.abs(velocity) / omega)
-    slope = found.modal_mass[0] * (curves.slopes[:, 0] + 1j * omega * curves.slopes[:, 1])
+    curves = posterior.curves(np.abs(velocity) / omega)
+    slope = posterior.modal_mass[0] * (curves.slopes[:, 0] + 1j * omega * curves.slopes[:, 1])
     z = 1j * omega * states.constant * states.force / velocity
     ones = np.ones(len(rows), dtype=complex)
-    return Reference(found, rows, ones + slope / z, 1j * ones)
+    return Reference(posterior, rows, ones + slope / z, 1j * ones)
 
 
 def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
-    """Some of the compared states as the model of a test sees them."""
+    """Some of the compared states as input to the model of a test."""
     chosen, model = predictions.chosen, predictions.model
     modes, sensor = model.modes, chosen.sensors[0]
     j = modes.mode_of_interest
     columns = [np.asarray(a)[rows] for a in chosen.states]
     states = type(chosen.states)(*columns)
-    # Of few sizes: operations of JAX compile for every one.
+    # Padded: JAX operations recompile for every array size.
     load: list[Any] = [padded(np.asarray(a)) for a in (states.frequency, states.force)]
-    beside: Array = residual_velocity(modes, *load)
+    residual_modes: Array = residual_velocity(modes, *load)
     sensed = sensed_mode(modes, load[0])
     to_mode, ratio_of_drive = (
         np.broadcast_to(np.asarray(part), len(load[0]))[: len(rows)]
@@ -95,14 +95,14 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
         force=np.asarray(states.force),
         velocity=np.sign(constant)
         * to_mode
-        * (np.asarray(states.velocity)[:, 0] - np.asarray(beside)[: len(rows), sensor]),
+        * (np.asarray(states.velocity)[:, 0] - np.asarray(residual_modes)[: len(rows), sensor]),
         errors=errors,
         stated=chosen.noise_stated,
         constant=abs(constant) * ratio_of_drive,
         level_std=(gain, phase, 2 * frequency / natural, damping / ratio if ratio > 0 else 0.0),
         mass_std=float(np.hypot(mass_std or 0.05, predictions.force_gain_std)),
         force_is_free=predictions.force_gain_std > 0,
-        # What all levels share is a hypothesis of its own: it must not pass for levels that differ.
+        # A common phase is a separate hypothesis: it must not count as level errors.
         phase_std=INSTRUMENT_PHASE,
     )
     if test.of_one_phase and modes.modal_mass_std is None:
@@ -111,28 +111,28 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
 
 
 def with_reference(predictions: Predictions) -> Predictions:
-    """The predictions weighed by what the states show by themselves.
+    """The predictions weighted by the smooth curves through the states.
 
-    Levels that differ beside smooth curves get errors of the size that these leave them.
+    Levels that deviate significantly from these get level errors of the estimated 1σ.
     """
     reference = reference_of(predictions)
     if reference is None:
         return predictions
-    found = reference.posterior
-    sizes = [
-        size if differs else 0.0
-        for size, differs in zip(found.hyper.level_std, found.differing, strict=True)
+    posterior = reference.posterior
+    stds = [
+        std if differs else 0.0
+        for std, differs in zip(posterior.hyper.level_std, posterior.differing, strict=True)
     ]
-    return _with_levels(dataclasses.replace(predictions, reference=reference), sizes)
+    return _with_levels(dataclasses.replace(predictions, reference=reference), stds)
 
 
-def _with_levels(predictions: Predictions, sizes: Sequence[float]) -> Predictions:
-    """With errors of levels of these sizes (1σ of `LEVEL_ERRORS`), where none is stated."""
-    found, model = predictions.reference.posterior, predictions.given
-    curves = found.curves(found.states.amplitude)
+def _with_levels(predictions: Predictions, stds: Sequence[float]) -> Predictions:
+    """Predictions with level errors of these 1σ (`LEVEL_ERRORS`), where none is stated."""
+    posterior, model = predictions.reference.posterior, predictions.given
+    curves = posterior.curves(posterior.states.amplitude)
     omega = float(np.sqrt(np.median(np.abs(curves.squared_frequency))))
     damping = float(np.median(np.abs(curves.modal_damping))) / (2 * omega)
-    gain, phase, stiffness, dissipation = sizes
+    gain, phase, stiffness, dissipation = stds
     fields = {
         "level_gain_std": gain,
         "level_phase_std": phase,
@@ -140,7 +140,7 @@ def _with_levels(predictions: Predictions, sizes: Sequence[float]) -> Prediction
         "level_damping_std": dissipation * damping,
     }
     free = tuple(
-        not stated > 0 and size > 0 for stated, size in zip(model.level_stds, sizes, strict=True)
+        not stated > 0 and std > 0 for stated, std in zip(model.level_stds, stds, strict=True)
     )
     new: dict[str, Any] = {
         name: jnp.asarray(fields[name]) for name, on in zip(fields, free, strict=True) if on
@@ -148,13 +148,13 @@ def _with_levels(predictions: Predictions, sizes: Sequence[float]) -> Prediction
     return dataclasses.replace(
         predictions,
         model=dataclasses.replace(model, **new),
-        level_sizes=tuple(sizes),
+        level_error_std=tuple(stds),
         unstated_levels=free,
     )
 
 
 def driven_by_voltage(data: SteadyStates) -> bool:
-    """Whether the force is known as a drive voltage only."""
+    """Whether the force is only known as a drive voltage."""
     force, drive = np.asarray(data.force), np.asarray(data.drive)
     return bool(not np.any(np.isfinite(force)) and np.any(np.isfinite(drive)))
 
@@ -162,12 +162,11 @@ def driven_by_voltage(data: SteadyStates) -> bool:
 def with_first_gain(
     model: Structure, data: SteadyStates
 ) -> tuple[SteadyStates, float, tuple[Fact | str, ...]]:
-    """The states with a force by a first value (N/V) of the unknown gain, and notes on it.
+    """The states with forces from a first value (N/V) of the unknown gain, that value, and notes.
 
-    The gain must stay free. It is the median, over the states, of the force that the model needs
-    for the measured motion over the drive voltage; and, where phases are known, what smooth curves
-    of amplitude make of that: with a gain of the force all of the dynamic stiffness grows, but not
-    the part of the known modal mass.
+    The gain must stay free. It is the median over the states of the force that the model requires
+    for the measured motion, over the drive voltage. Where phases are known it is refined by smooth
+    curves of amplitude: a gain scales all of the dynamic stiffness, and the modal mass is known.
 
     Raises `ValueError` where the model has no such motions.
     """
@@ -178,13 +177,13 @@ def with_first_gain(
     predictions = predictions_of(model, driven(1.0), priors.FREE_GAIN_STD, kinds=())
     needed, unknown = weighted_misfit(predictions).baseline.force, predictions.chosen.phase_unknown
     phase = np.angle(np.asarray(predictions.chosen.states.velocity)[:, 0])
-    # With known phases the part against damping, which no error of the stiffness changes.
+    # With known phases use the part against damping, independent of stiffness errors.
     part = np.real(needed * np.exp(-1j * phase)) / np.maximum(np.cos(phase), 0.5)
     gains = np.abs(needed if unknown.any() else part)
     if not np.any(np.isfinite(gains)):
         raise ValueError("the model has no motion of the measured amplitude for any state.")
     gain, caveat, from_curves = float(np.median(gains[np.isfinite(gains)])), None, False
-    # Twice: the first curves' prior lies about what the model as given needs.
+    # Twice: the prior of the first curves is centred on the given model's forces.
     for _ in range(0 if unknown.any() else 2):
         reference = reference_of(
             predictions_of(model, driven(gain), priors.FREE_GAIN_STD, kinds=())
@@ -192,7 +191,7 @@ def with_first_gain(
         if reference is None:
             break
         mass, std = reference.posterior.modal_mass
-        if not mass > 0:  # no passive structure's: the first value stays
+        if not mass > 0:  # not physical: keep the first value
             caveat = force_gain_undetermined(np.inf, 0.0)
             break
         gain, from_curves = gain / mass, True

@@ -1,1 +1,1 @@
-"""Which laws explain most of what a test shows beyond its model, how much, and what is left."""
+"""The laws behind the excess of a test over its model, their fraction, and the remainder."""

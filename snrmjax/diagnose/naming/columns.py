@@ -1,6 +1,6 @@
-"""What every hypothesis of a diagnosis changes in the readings, to first order: one column each.
+"""First-order change of the readings by every hypothesis of a diagnosis: one column each.
 
-A parameter that is not linear (a gap, an exponent) has a column for each value of a grid.
+A nonlinear parameter (a gap, an exponent) has a column for each value of a grid.
 """
 
 import itertools
@@ -17,43 +17,43 @@ from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effect_shape import starts_of
 from snrmjax.model.effects import EFFECTS, is_own, make_effect
 
-_SAMPLES, _AMPLITUDES = 256, 60  # of a user's own force
-_PARTS = 3  # that an interval of a shape is divided into, where it counts
+_SAMPLES, _AMPLITUDES = 256, 60  # for a user's own force
+_PARTS = 3  # of a shape's interval, when refined
 
 
 class Column(NamedTuple):
-    """One value of the shape parameters of one kind of effect."""
+    """One kind of effect at one value of its shape parameters."""
 
     kind: str
     shape: tuple[float, ...]  # in the units of `describing`
     change: Complex[np.ndarray, " state"]  # of the dynamic stiffness, over ω₀²; largest entry 1
-    higher: Complex[np.ndarray, "order state"]  # of its other harmonics that were recorded, alike
-    scale: float  # of that change over the one of strength 1 in the units of `describing`
-    sign: int = 0  # that physics gives the strength; 0: either
-    std: float | None = None  # 1σ of the strength where it is an instrument's; None: any size
-    fraction: float = 1.0  # of its kind's prior
-    widths: tuple[float, ...] = ()  # of the intervals that the shape stands for
+    higher: Complex[np.ndarray, "order state"]  # of its other recorded harmonics, likewise
+    scale: float  # divisor of that change: strength 1 in the units of `describing`
+    sign: int = 0  # physical sign of the strength; 0: either
+    std: float | None = None  # 1σ of the strength of an instrument error; None: over `STRENGTHS`
+    fraction: float = 1.0  # weight within its kind's prior
+    widths: tuple[float, ...] = ()  # of the intervals about the shape
     start: tuple[float, ...] = ()  # parameters of a user's own force at strength 1
 
     def divided(self, readings: Readings) -> "list[Column]":
-        """Columns for the parts of its intervals."""
+        """Columns of the refined grid within its intervals."""
         n = len(self.widths)
         steps = (np.arange(_PARTS) - (_PARTS - 1) / 2) / _PARTS
         parts = []
         for step in itertools.product(steps, repeat=n):
-            moved = zip(self.shape[:n], self.widths, step, strict=True)
-            shape = (*(s + w * k for s, w, k in moved), *self.shape[n:])
+            shifted = zip(self.shape[:n], self.widths, step, strict=True)
+            shape = (*(s + w * k for s, w, k in shifted), *self.shape[n:])
             widths = tuple(w / _PARTS for w in self.widths)
             parts += _column(readings, self.kind, shape, self.fraction / _PARTS**n, widths)
         return parts
 
 
 def hypothesis_columns(readings: Readings, kinds: Iterable[str]) -> list[Column]:
-    """The columns of some kinds of effects; kinds that no column states are left out."""
-    found: list[Column] = []
+    """The columns of some kinds of effects; kinds without columns are left out."""
+    columns: list[Column] = []
     for kind in kinds:
         if kind not in LAWS:
-            found += _of_own_force(readings, kind)
+            columns += _of_own_force(readings, kind)
             continue
         axes = LAWS[kind].axes
         choices = LAWS[kind].choices if readings.harmonics else LAWS[kind].choices[:1]
@@ -64,14 +64,14 @@ def hypothesis_columns(readings: Readings, kinds: Iterable[str]) -> list[Column]
         ):
             fraction = float(np.prod(widths) / total)
             for last in ((choice,) for choice in choices) if choices else ((),):
-                found += _column(readings, kind, (*shape, *last), fraction, widths)
-    return found
+                columns += _column(readings, kind, (*shape, *last), fraction, widths)
+    return columns
 
 
 def _of_own_force(readings: Readings, kind: str) -> list[Column]:
-    """Columns of a force that a user registered, one for each set of parameters that it states.
+    """Columns of a user-registered force, one for each of its sets of starting parameters.
 
-    By quadrature of its cycle at the natural frequency, between amplitudes by interpolation.
+    By quadrature over a cycle at the natural frequency, interpolated between amplitudes.
     """
     effect = EFFECTS[kind]
     if not (is_own(kind) and issubclass(effect, AbstractForce)):
@@ -82,7 +82,7 @@ def _of_own_force(readings: Readings, kind: str) -> list[Column]:
     q = readings.largest * grid[:, None] * np.cos(angle)
     rate = -readings.natural_frequency * readings.largest * grid[:, None] * np.sin(angle)
     names, starts = tuple(effect.parameters()), starts_of(effect, readings.scales)
-    found = []
+    columns = []
     for start in starts:
         law: Any = make_effect(kind, dict(zip(names, start, strict=True)))
         force = np.asarray(jax.jit(jax.vmap(law.cycle_force))(q, rate))
@@ -91,9 +91,9 @@ def _of_own_force(readings: Readings, kind: str) -> list[Column]:
         for order in (1, *(one.order for one in readings.harmonics)):
             change = 2 * np.mean(force * np.exp(-1j * order * angle), axis=1) / unit
             of_states.append(np.interp(np.log(x), np.log(grid), change))
-        own = of_states[0], np.array(of_states[1:]).reshape(-1, len(x))
-        found += _scaled(kind, *own, fraction=1 / len(starts), start=start)
-    return found
+        changes = of_states[0], np.array(of_states[1:]).reshape(-1, len(x))
+        columns += _scaled(kind, *changes, fraction=1 / len(starts), start=start)
+    return columns
 
 
 def _column(
@@ -103,12 +103,12 @@ def _column(
     fraction: float,
     widths: tuple[float, ...],
 ) -> list[Column]:
-    """One column, or none where it changes nothing."""
+    """One column, or none if it changes nothing."""
     law, higher = LAWS[kind], np.zeros((len(readings.harmonics), len(readings.force)), complex)
     change = law.change(readings, *shape)
     if law.higher is not None:
-        for place, one in enumerate(readings.harmonics):
-            higher[place] = law.higher(readings, one, *shape)
+        for index, one in enumerate(readings.harmonics):
+            higher[index] = law.higher(readings, one, *shape)
     shapes = {"shape": tuple(map(float, shape)), "widths": tuple(map(float, widths))}
     return _scaled(kind, change, higher, fraction=fraction, sign=law.sign, std=law.std, **shapes)
 
@@ -122,7 +122,7 @@ def _scaled(
     shape: tuple[float, ...] = (),
     **numbers: Any,
 ) -> list[Column]:
-    """A column whose largest entry is 1, or none where it changes nothing."""
+    """A column scaled to a largest entry of 1, or none if it changes nothing."""
     largest = np.max(np.abs(change), initial=0.0) or np.max(np.abs(higher), initial=0.0)
     scale = 1.0 if std is not None else float(largest)
     if not (np.isfinite(scale) and largest > 0):
@@ -131,7 +131,7 @@ def _scaled(
 
 
 def parameters_of(readings: Readings, column: Column, strength: float) -> dict[str, float] | None:
-    """The effect's parameters by name, in modal units; None where the readings do not give them."""
+    """The effect's parameters by name, in modal units; None if readings do not determine them."""
     law, own = LAWS.get(column.kind), strength / column.scale
     if column.start:
         values: tuple[float, ...] = (own * column.start[0], *column.start[1:])
@@ -143,10 +143,10 @@ def parameters_of(readings: Readings, column: Column, strength: float) -> dict[s
 
 
 def is_instrument(kind: str) -> bool:
-    """Whether a kind is an error of a test and no property of the structure."""
+    """Whether a kind is a measurement error, not a property of the structure."""
     return kind in LAWS and LAWS[kind].of_instrument
 
 
 def odds_of(kind: str) -> float:
-    """How likely a kind is before a test is seen, over a law of the library."""
+    """Prior odds of a kind over a law of the library."""
     return LAWS[kind].odds if kind in LAWS else 1.0

@@ -1,7 +1,7 @@
-"""Describing functions of the library's laws: stiffness and damping of a harmonic motion.
+"""Describing functions of the library's laws: equivalent stiffness and damping.
 
 For q = a cos Ωt the fundamental of a force is (k + iΩc) a. Values are relative to ω₀² (k) and to ω₀
-(c), and the argument x is the amplitude over the largest one of the test.
+(c), and the argument x is the amplitude over the largest of the test.
 Reference: Gelb & Vander Velde, Multiple-Input Describing Functions and Nonlinear System Design
 (1968), appendix B; for Masing's rule on a power law, Segalman, ASME J. Appl. Mech. 72 (2005) 752.
 """
@@ -14,13 +14,13 @@ from jaxtyping import Complex, Float
 Amplitudes = Float[np.ndarray, " state"]
 Cycle = Float[np.ndarray, "state sample"]
 Force = Callable[[Cycle, Cycle], Cycle]
-"""Of a displacement x cos t and of its slope −x sin t, over half a cycle or the whole."""
+"""Of a displacement x cos t and its derivative −x sin t, over half a cycle or the whole."""
 
 _SAMPLES = 256
 
 
 def harmonic(force: Force, x: Amplitudes, order: int) -> Complex[np.ndarray, " state"]:
-    """Harmonic of a force that a harmonic motion causes, over the amplitude: f = Re Σ cₕ eʰⁱᵗ.
+    """Harmonic cₕ of the force under harmonic motion, over the amplitude: f = Re Σ cₕ eʰⁱᵗ.
 
     By quadrature over the cycle.
     """
@@ -30,15 +30,15 @@ def harmonic(force: Force, x: Amplitudes, order: int) -> Complex[np.ndarray, " s
 
 
 def gap(x: Amplitudes, width: float) -> Amplitudes:
-    """Stiffness of springs of stiffness 1 behind gaps of a width on both sides."""
+    """Equivalent stiffness of springs of stiffness 1 behind gaps of equal width on both sides."""
     r = np.clip(width / np.maximum(x, 1e-12), 0.0, 1.0)
     return np.where(x > width, 1 - (2 / np.pi) * (np.arcsin(r) + r * np.sqrt(1 - r * r)), 0.0)
 
 
 def mean_at_stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
-    """Mean of a motion that a spring of ω₀² `stiffness` behind a gap on one side pushes back.
+    """Mean displacement q₀ under contact with a one-sided spring of ω₀² `stiffness`.
 
-    q₀ + stiffness · mean contact force = 0, by bisection.
+    From q₀ + stiffness · mean contact force = 0, by bisection.
     """
     low, high = -x, np.zeros_like(x)
     for _ in range(50):
@@ -52,7 +52,7 @@ def mean_at_stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
 
 
 def stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
-    """Stiffness of a spring of ω₀² `stiffness` behind a gap on one side, over that stiffness."""
+    """Equivalent stiffness of a one-sided spring behind a gap, over its ω₀² `stiffness`."""
     mean = mean_at_stop(x, width, stiffness)
     s = np.clip((width - mean) / np.maximum(x, 1e-12), -1.0, 1.0)
     angle = np.arccos(s)
@@ -60,7 +60,7 @@ def stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
 
 
 def slider(x: Amplitudes, slip: float) -> tuple[Amplitudes, Amplitudes]:
-    """Loss of stiffness, and Ω times damping, of a slider of stuck stiffness 1."""
+    """Loss of stiffness, and Ω times damping, of a Jenkins slider of stuck stiffness 1."""
     r = np.clip(slip / np.maximum(x, 1e-12), 0.0, 1.0)
     t = np.arccos(1 - 2 * r)
     slips = x > slip
@@ -71,7 +71,7 @@ def slider(x: Amplitudes, slip: float) -> tuple[Amplitudes, Amplitudes]:
 def masing(exponent: float, samples: int = 400) -> tuple[float, float]:
     """Loss of stiffness, and Ω times damping, of the backbone −|x|^p sgn x with Masing's rule.
 
-    At unit amplitude; at others both are x^(p − 1) times as large.
+    At unit amplitude; both scale as x^(p − 1).
     """
     t = (np.arange(samples) + 0.5) * np.pi / samples
     q = np.cos(t)
@@ -80,7 +80,7 @@ def masing(exponent: float, samples: int = 400) -> tuple[float, float]:
 
 
 def slipping(q: Cycle, slope: Cycle, slip: float) -> Cycle:
-    """Force of a slider of stuck stiffness 1, less that of the stuck one."""
+    """Force of a Jenkins slider of stuck stiffness 1, less its stuck force."""
     largest = np.max(np.abs(q), axis=1, keepdims=True)
     down = np.maximum(_falling(q, slope) - largest + slip, -slip)
     force = np.where(slope <= 0, down, -down)
@@ -95,7 +95,7 @@ def microslip(q: Cycle, slope: Cycle, exponent: float) -> Cycle:
 
 
 def _falling(q: Cycle, slope: Cycle) -> Cycle:
-    """The displacement, mirrored where it rises: both halves of a loop are one curve."""
+    """The displacement, mirrored while it rises: maps both loop branches to the falling one."""
     return np.where(slope <= 0, q, -q)
 
 
@@ -104,8 +104,8 @@ def quadratic(
 ) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, " state"]]:
     """Fundamental and second harmonic of a spring of force `strength` q², over the amplitude.
 
-    `strength` is over ω₀² and the largest amplitude. By the mean and the second harmonic of the
-    motion: q₀ + ½ s a² + … = 0, in fixed-point steps.
+    `strength` is relative to ω₀² and the largest amplitude. With the mean and the second harmonic
+    of the motion, q₀ + ½ s a² + … = 0, by fixed-point iteration.
     """
     own = 1 - 4 * frequency**2 + 4j * ratio * frequency
     mean, second = np.zeros_like(x), np.zeros_like(x) + 0j
@@ -120,10 +120,10 @@ def quadratic(
 def resonant(
     x: Amplitudes, frequency: Float[np.ndarray, " state"], order: int, detuning: float, ratio: float
 ) -> Complex[np.ndarray, " state"]:
-    """Dynamic stiffness that a mode at n (1 + detuning) ω₀ with V = b qⁿ p adds.
+    """Dynamic stiffness added by a mode at n (1 + detuning) ω₀ with V = b qⁿ p.
 
     For n b² a²ⁿ⁻²/4ⁿ⁻¹ = ω₀⁴ x²ⁿ⁻².
-    Arguments: `frequency` Ω/ω₀; `order` n, 2 or 3; `ratio` the damping ratio of that mode.
+    Arguments: `frequency`: Ω/ω₀; `order`: n, 2 or 3; `ratio`: damping ratio of that mode.
     """
     own = order * (1 + detuning)
     driven = order * frequency

@@ -1,4 +1,4 @@
-"""How large a further effect would have to be to be seen, by the rows of the same problem."""
+"""Detection limits of further effects, from the rows of the same problem."""
 
 import itertools
 from collections.abc import Collection
@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import hypothesis_columns, is_instrument, parameters_of
-from snrmjax.diagnose.naming.evidence import seen_strengths
+from snrmjax.diagnose.naming.evidence import detectable_strengths
 from snrmjax.diagnose.naming.parts import Naming
 from snrmjax.diagnose.naming.rows import Problem
 from snrmjax.model.effect_base import AbstractEffect
@@ -19,28 +19,28 @@ from snrmjax.model.effects import EFFECTS, effect_parameters
 def detection_limits(
     problem: Problem, naming: Naming, excluded: Collection[str]
 ) -> dict[str, float]:
-    """The least strength of every further effect that would have been detected, in its own unit.
+    """The smallest detectable strength of every further effect, in its own unit.
 
-    By parameter, with the shape that shows best. Not given for the effects of the answer, for those
-    `excluded`, and for what the data do not show at all.
+    By parameter, at the most detectable shape. Left out are the effects of the answer, those
+    `excluded`, and those to which the data are insensitive.
     """
     known = [problem.columns[k] for k in naming.cell.columns]
     tried = {column.kind for column in problem.columns} - {*excluded, *naming.effects}
     kinds = (kind for kind, effect in EFFECTS.items() if effect.searched and kind in tried)
-    # Of every shape, not of those alone that might explain these rows.
+    # All shapes, not only those refined for these rows.
     problem = problem.with_columns([*known, *hypothesis_columns(problem.readings, kinds)])
     cell = naming.cell._replace(columns=tuple(range(len(known))))
-    strength = seen_strengths(problem, cell, priors.DETECTED)
-    smallest = 2 * priors.BELOW_BANDWIDTH * problem.readings.damping_ratio  # less is no finding
+    strength = detectable_strengths(problem, cell, priors.DETECTED)
+    smallest = 2 * priors.BELOW_BANDWIDTH * problem.readings.damping_ratio  # relevant change
     limits: dict[str, float] = {}
     further = zip(problem.columns, strength.tolist(), strict=True)
-    for column, shown in itertools.islice(further, len(known), None):
-        kind, seen = column.kind, shown
+    for column, by_rows in itertools.islice(further, len(known), None):
+        kind, detectable = column.kind, by_rows
         if not (is_instrument(kind) or np.any(column.higher)):
-            seen = max(shown, smallest / float(np.max(np.abs(column.change))))
+            detectable = max(by_rows, smallest / float(np.max(np.abs(column.change))))
         sign = column.sign or 1
-        values = parameters_of(problem.readings, column, sign * seen)
-        if values is None or not np.isfinite(seen):
+        values = parameters_of(problem.readings, column, sign * detectable)
+        if values is None or not np.isfinite(detectable):
             continue
         first = effect_parameters(kind)[0]
         name, value = f"{kind}.{first}", abs(values[first])
@@ -50,10 +50,10 @@ def detection_limits(
 
 
 def beyond_data(effect: type[AbstractEffect], limit: float, scales: MotionScales | None) -> bool:
-    """Whether an effect at its detection limit would exceed all that was measured ten times.
+    """Whether the change by an effect at its detection limit exceeds ten times all measured.
 
-    Arguments: `limit` of its strength, in its own unit; `scales` of the measured motions, without
-    which relative strengths alone are judged.
+    Arguments: `limit`: of its strength, in its own unit; `scales`: of the measured motions, without
+    which only relative strengths are assessed.
     """
     unit = next(iter(effect.parameters().values())).unit
     if not np.isfinite(limit) or (unit == "1" and limit > priors.BEYOND_DATA):

@@ -1,9 +1,9 @@
 """Evidences of laws, alone and together, in closed form.
 
-With the sizes of the remainders fixed, rows y = Aθ + e have e ~ N(0, C). All that counts of the
-columns A is b = AᵀC⁻¹y and S = AᵀC⁻¹A, from one Cholesky factor; for θ ~ N(0, τ²) evidences are
-those of one and two Gaussian numbers, or of their positive half. Blocks of rows have nothing but
-the laws in common, so that their b and S add up.
+With the standard deviations of the remainders fixed, rows y = Aθ + e have e ~ N(0, C). Sufficient
+for the columns A are b = AᵀC⁻¹y and S = AᵀC⁻¹A, from one Cholesky factor; for θ ~ N(0, τ²) the
+evidences are one- and two-dimensional Gaussian integrals, over a half-space if the sign is known.
+Blocks of rows share only the laws, so that their b and S add up.
 """
 
 from typing import NamedTuple
@@ -15,41 +15,41 @@ from scipy.special import log_ndtr, logsumexp
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column, odds_of
-from snrmjax.diagnose.naming.rows import Cell, Problem, RowBlock, Sizes
+from snrmjax.diagnose.naming.rows import Cell, Problem, RemainderStds, RowBlock
 from snrmjax.model.library.measurement_chain import ForceHarmonics
 
-_ALIKE = 2 * (priors.BAND * priors.DESCRIBED) ** 2  # of a column, that errors of two laws may be
-PRIOR_OF_PAIRS = np.log(priors.SIZES[2]) + 5 * np.log(2)  # at most, with both signs known
+_ALIKE = 2 * (priors.BAND * priors.DESCRIBED) ** 2  # least sin² of the angle between two laws
+PRIOR_OF_PAIRS = np.log(priors.EFFECT_COUNTS[2]) + 5 * np.log(2)  # at most, with both signs known
 
 
-def sizes_of_remainders(every: int) -> list[float]:
-    """Sizes that a remainder of stiffness or damping is tried with; `every` second one."""
+def remainder_stds(every: int) -> list[float]:
+    """Standard deviations tried for a remainder of stiffness or damping, each `every`-th one."""
     return [0.0, *priors.REMAINDERS[::every].tolist()]
 
 
-def _log_prior(sizes: Sizes) -> float:
-    of_harmonic = len(sizes) == 1
+def _log_prior(stds: RemainderStds) -> float:
+    of_harmonic = len(stds) == 1
     some = len(priors.HARMONIC_REMAINDERS) - 1 if of_harmonic else len(priors.REMAINDERS)
     fraction = (1 - priors.NO_REMAINDER) / some
-    return float(sum(np.log(priors.NO_REMAINDER if s == 0 else fraction) for s in sizes))
+    return float(sum(np.log(priors.NO_REMAINDER if s == 0 else fraction) for s in stds))
 
 
 class LawSums(NamedTuple):
-    """What counts of all columns for remainders of some sizes."""
+    """b and S of all columns, for given standard deviations of the remainders."""
 
-    sizes: Sizes
-    base: float  # ln p of the rows without any law, times the prior of the sizes
+    remainder_std: RemainderStds
+    base: float  # ln p of the rows without any law, times the prior of `remainder_std`
     b: Float[np.ndarray, " column"]
     gram: Float[np.ndarray, "column column"]
     kind: np.ndarray  # of every column
     sign: Int[np.ndarray, " column"]
-    std: Float[np.ndarray, " column"]  # NaN: of any size
+    std: Float[np.ndarray, " column"]  # NaN: over `STRENGTHS`
     prior: Float[np.ndarray, " column"]  # probability among single laws
 
     @classmethod
-    def of(cls, columns: list[Column], block: RowBlock, sizes: Sizes) -> "LawSums":
-        """By one Cholesky factor."""
-        root = block.triangle * np.sqrt(block.variances(sizes))
+    def of(cls, columns: list[Column], block: RowBlock, remainder_std: RemainderStds) -> "LawSums":
+        """From one Cholesky factor."""
+        root = block.triangle * np.sqrt(block.variances(remainder_std))
         factor = cholesky(root @ root.T + np.eye(len(root)), lower=True)
         white = solve_triangular(factor, block.along, lower=True)
         gram = block.across + white.T @ white
@@ -58,30 +58,36 @@ class LawSums(NamedTuple):
         odds = {kind: odds_of(kind) for kind in dict.fromkeys(kinds)}
         every = sum(odds.values())
         return cls(
-            *(sizes, base + _log_prior(sizes), gram[:-1, -1], gram[:-1, :-1], np.array(kinds)),
+            *(
+                remainder_std,
+                base + _log_prior(remainder_std),
+                gram[:-1, -1],
+                gram[:-1, :-1],
+                np.array(kinds),
+            ),
             np.array([column.sign for column in columns]),
             np.array([np.nan if c.std is None else c.std for c in columns]),
             np.array([odds[c.kind] / every * c.fraction for c in columns]),
         )
 
     def with_rows_of(self, other: "LawSums") -> "LawSums":
-        """By the rows of both."""
+        """From the rows of both."""
         return self._replace(
-            sizes=(*self.sizes, *other.sizes),
+            remainder_std=(*self.remainder_std, *other.remainder_std),
             base=self.base + other.base,
             b=self.b + other.b,
             gram=self.gram + other.gram,
         )
 
     def strengths(self, some: Int[np.ndarray, " some"], every: int) -> np.ndarray:
-        """1σ of the strengths of some columns that are tried, (some, strength)."""
+        """Prior 1σ values tried for the strengths of some columns, (some, strength)."""
         values = priors.STRENGTHS[::every]
         tried = np.broadcast_to(values, (len(some), len(values)))
         std = self.std[some, None]
         return np.where(np.isfinite(std), std, tried)
 
-    def most(self) -> Float[np.ndarray, "column column"]:
-        """What the rows of a pair can gain at most, with the base: no strength is larger than 1."""
+    def bound(self) -> Float[np.ndarray, "column column"]:
+        """Upper bound of a pair's ln likelihood, ½ bᵀS⁻¹b plus base; prior 1σ is at most 1."""
         s = np.diag(self.gram) + 1.0
         both = np.multiply.outer(s, s)
         across = np.maximum(both - self.gram**2, 1e-9 * both)
@@ -90,40 +96,42 @@ class LawSums(NamedTuple):
         return 0.5 * square / across + self.base
 
     def prior_of_pairs(self) -> Float[np.ndarray, "column column"]:
-        """ln of the largest prior of every pair, each once; -∞ of columns that are none."""
+        """ln of the largest prior of every pair, each once; −∞ for columns that make no pair."""
         apart = (self.kind[:, None] != self.kind) | (self.kind == ForceHarmonics.kind)
         log_prior = np.log(self.prior)
         prior = np.add.outer(log_prior, log_prior) + PRIOR_OF_PAIRS
         return np.where(np.triu(apart, 1), prior, -np.inf)
 
     def pairs(self, i: np.ndarray, j: np.ndarray, least: float) -> list[Cell]:
-        """Of some pairs those that are as probable as `least`."""
+        """Those of some pairs whose log evidence exceeds `least`."""
         likely = self._likely(i, j) > least
         i, j = i[likely], j[likely]
         if not i.size:
             return []
         blocks = range(0, len(i), 4096)
         values = [self._pair(i[begin : begin + 4096], j[begin : begin + 4096]) for begin in blocks]
-        # Sizes of remainders are coarser than those of single laws, and as likely together.
-        fewer = (len(priors.REMAINDERS) - 1) / (len(sizes_of_remainders(2)) - 2)
-        prior = np.log(priors.SIZES[2]) + np.log(fewer) * np.count_nonzero(self.sizes[:2])
+        # Pairs use a coarser grid of remainders than single laws, with the same total prior.
+        fewer = (len(priors.REMAINDERS) - 1) / (len(remainder_stds(2)) - 2)
+        prior = np.log(priors.EFFECT_COUNTS[2]) + np.log(fewer) * np.count_nonzero(
+            self.remainder_std[:2]
+        )
         value = np.concatenate(values) + self.base + prior
         keep = np.flatnonzero(value > least)
-        return [Cell(float(value[k]), (int(i[k]), int(j[k])), self.sizes) for k in keep]
+        return [Cell(float(value[k]), (int(i[k]), int(j[k])), self.remainder_std) for k in keep]
 
     def together(self, columns: tuple[int, ...]) -> Cell | None:
-        """Several laws as one hypothesis; None where one of them is not seen beside the others."""
+        """Several laws as one hypothesis; None if any is insignificant with the others."""
         first, second, *further = columns
-        found = self.pairs(np.array([first]), np.array([second]), -np.inf)
+        cells = self.pairs(np.array([first]), np.array([second]), -np.inf)
         for column in further:
-            more = self.with_one_more(found[0], -np.inf) if found else []
-            found = [cell for cell in more if cell.columns[-1] == column]
-        return found[0] if found else None
+            more = self.with_one_more(cells[0], -np.inf) if cells else []
+            cells = [cell for cell in more if cell.columns[-1] == column]
+        return cells[0] if cells else None
 
     def with_one_more(self, cell: Cell, least: float) -> list[Cell]:
-        """A hypothesis with every further law that is seen, where it is as probable as `least`.
+        """A hypothesis with each further significant law, where its log evidence exceeds `least`.
 
-        As for a single law, of rows from which the hypothesis' own laws are taken away.
+        As for a single law, after projecting out the hypothesis' own laws.
         """
         own, n_laws = list(cell.columns), len(cell.columns) + 1
         wide = np.where(np.isnan(self.std[own]), 1.0, self.std[own])
@@ -133,12 +141,14 @@ class LawSums(NamedTuple):
         smallest = _ALIKE * np.diag(self.gram)
         apart, square = square > smallest, np.maximum(square, smallest)
         value = self.gains(b, square, 2) + np.log(n_laws * self.prior)
-        value += cell.log_evidence + np.log(priors.SIZES[n_laws] / priors.SIZES[n_laws - 1])
+        value += cell.log_evidence + np.log(
+            priors.EFFECT_COUNTS[n_laws] / priors.EFFECT_COUNTS[n_laws - 1]
+        )
         further = ~np.isin(self.kind, self.kind[own]) | (self.kind == ForceHarmonics.kind)
         further[own] = False
-        seen = apart & (b**2 > priors.VISIBLE**2 * square)
-        some = np.flatnonzero(further & seen & (value > least)).tolist()
-        return [Cell(float(value[k]), (*cell.columns, k), cell.sizes) for k in some]
+        significant = apart & (b**2 > priors.VISIBLE**2 * square)
+        some = np.flatnonzero(further & significant & (value > least)).tolist()
+        return [Cell(float(value[k]), (*cell.columns, k), cell.remainder_std) for k in some]
 
     def gains(
         self,
@@ -146,7 +156,7 @@ class LawSums(NamedTuple):
         square: Float[np.ndarray, "*rest column"],
         every: int,
     ) -> Float[np.ndarray, "*rest column"]:
-        """ln of what every column alone gains, over all strengths, or `every` second one."""
+        """ln Bayes factor of every column alone, averaged over strengths, each `every`-th one."""
         narrow = self.strengths(np.arange(len(self.b)), every) ** -2.0
         precision = square[..., None] + narrow
         mean = b[..., None] / precision
@@ -155,10 +165,10 @@ class LawSums(NamedTuple):
         return logsumexp(value, axis=-1) - np.log(value.shape[-1])
 
     def _likely(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """What pairs may reach: with the strengths' best prior, a half nat of slack for each.
+        """Approximate upper bound of pairs' log evidence, with half a nat of slack for each law.
 
-        A pair of which one is not seen reads as the other alone, and is left out; so is one whose
-        laws differ by less than describing functions are right.
+        Excluded (−∞) are pairs with an insignificant law, which amount to the other law alone, and
+        pairs whose laws differ by less than the error of describing functions.
         """
         s, t, b, c, g = *np.diag(self.gram)[[i, j]], *self.b[[i, j]], self.gram[i, j]
         s, t = s + 1.0, t + 1.0
@@ -188,7 +198,7 @@ class LawSums(NamedTuple):
 
 
 class HarmonicSums(NamedTuple):
-    """What counts of other harmonics for single laws, for all combinations of sizes at once."""
+    """b and S of other harmonics for single laws, for all combinations of remainders at once."""
 
     base: Float[np.ndarray, " combination"]
     b: Float[np.ndarray, "combination column"]
@@ -206,28 +216,28 @@ class HarmonicSums(NamedTuple):
     def singles(self, own: LawSums) -> tuple[np.ndarray, np.ndarray]:
         """ln evidence without a law, and of every law alone: (combination,), (combination, column).
 
-        By the fundamentals' rows too.
+        Includes the rows of the fundamentals.
         """
         base = own.base + self.base
         value = own.gains(own.b + self.b, np.diag(own.gram) + self.square, 1) + np.log(own.prior)
-        value = value + base[:, None] + np.log(priors.SIZES[1])
-        return base + np.log(priors.SIZES[0]), value
+        value = value + base[:, None] + np.log(priors.EFFECT_COUNTS[1])
+        return base + np.log(priors.EFFECT_COUNTS[0]), value
 
 
 def _log_half(sign: np.ndarray, standardised: np.ndarray) -> np.ndarray:
-    """ln of what a law of one sign gains: the posterior's part of that sign, over the prior's."""
+    """ln of the posterior probability of a law's known sign over the prior one, ½; 0 if unknown."""
     return np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * standardised))
 
 
-def seen_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.ndarray, " column"]:
-    """Of every column the strength that would raise the evidence of a hypothesis by some nats."""
-    normal = LawSums.of(problem.columns, problem.blocks[0], cell.sizes[:2])
-    for block, size in zip(problem.blocks[1:], cell.sizes[2:], strict=True):
-        normal = normal.with_rows_of(LawSums.of(problem.columns, block, (size,)))
+def detectable_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.ndarray, " column"]:
+    """Detectable strength of each column in addition to a hypothesis."""
+    normal = LawSums.of(problem.columns, problem.blocks[0], cell.remainder_std[:2])
+    for block, std in zip(problem.blocks[1:], cell.remainder_std[2:], strict=True):
+        normal = normal.with_rows_of(LawSums.of(problem.columns, block, (std,)))
     some, n_rows = list(cell.columns), sum(len(block.rows) for block in problem.blocks)
     across = normal.gram[:, some]
     known = across @ np.linalg.pinv(normal.gram[np.ix_(some, some)], hermitian=True)
     precision = np.diag(normal.gram) - np.sum(known * across, axis=1)
-    # The fall of χ² has to pay for the choice, and for one number more.
+    # Δχ² ≥ `nats` for the choice and ln n for one parameter (Schwarz).
     need = nats + np.log(n_rows)
     return np.sqrt(need / np.maximum(precision, 1e-12))

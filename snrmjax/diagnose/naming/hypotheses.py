@@ -1,7 +1,7 @@
-"""Hypotheses that can count: laws alone, in pairs and more, with remainders of every size.
+"""Search of hypotheses: laws alone, in pairs and more, over a grid of remainders.
 
-Pairs that cannot reach the best answer, as ½ bᵀS⁻¹b bounds them, are left out; three and more laws
-go on from the best of fewer.
+Pairs whose bound ½ bᵀS⁻¹b is below the best answer are left out; sets of three and more laws are
+grown from the best smaller ones.
 """
 
 import functools
@@ -18,24 +18,24 @@ from snrmjax.diagnose.naming.columns import Column, hypothesis_columns
 from snrmjax.diagnose.naming.evidence import (
     HarmonicSums,
     LawSums,
-    sizes_of_remainders,
+    remainder_stds,
 )
 from snrmjax.diagnose.naming.readings import Readings
-from snrmjax.diagnose.naming.rows import Cell, Problem, RowBlock, Sizes, problem_of
+from snrmjax.diagnose.naming.rows import Cell, Problem, RemainderStds, RowBlock, problem_of
 
-_ROUNDS = 3  # of finer shapes
-_COARSE = 40.0  # nats that a coarse shape may lack
-_REACH = 16.0  # nats below the best, down to which a column is kept while shapes are refined
-_COUNTS = 0.02  # probability from which on a shape is divided
-_GONE_ON = 4  # sets of laws, from which those of one more go on
-_LEAST = 8.0  # of ln p below the most probable answer: what is less likely is left out
+_ROUNDS = 3  # of refined shapes
+_COARSE = 40.0  # nats that a coarse shape may be below the best
+_REACH = 16.0  # nats below the best within which a column is kept while shapes are refined
+_COUNTS = 0.02  # probability from which on a shape is refined
+_EXTENDED = 4  # sets of laws that are extended by one more
+_LEAST = 8.0  # nats below the most probable answer within which hypotheses are kept
 
 
 def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, list[Cell]]:
-    """All hypotheses that can count, the most probable first; their shapes as fine as needed."""
+    """All relevant hypotheses, the most probable first, with refined shapes."""
     problem = _with_likeliest_length(readings, hypothesis_columns(readings, kinds))
     for _ in range(_ROUNDS):
-        cells, alone = _weighed(problem, 2, _REACH)
+        cells, alone = _compared(problem, 2, _REACH)
         counts = _worth_dividing(problem, cells, alone)
         if not counts:
             break
@@ -48,7 +48,7 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
 
 
 def _with_likeliest_length(readings: Readings, columns: list[Column]) -> Problem:
-    """The problem with remainders that change over the likeliest amplitudes, by single laws."""
+    """The problem with the most probable correlation length of remainders, by single laws."""
     problems = (problem_of(readings, columns, length) for length in priors.REMAINDER_LENGTHS)
     return max(problems, key=_log_evidence_of_singles)
 
@@ -56,18 +56,18 @@ def _with_likeliest_length(readings: Readings, columns: list[Column]) -> Problem
 def _worth_dividing(
     problem: Problem, cells: list[Cell], alone: Float[np.ndarray, " column"]
 ) -> list[int]:
-    """Columns whose shape counts: of every kind the best, and all that are probable."""
-    mass = np.zeros(len(problem.columns))
+    """Columns to refine: the best of every kind, and all probable ones."""
+    weight = np.zeros(len(problem.columns))
     for cell in cells:
-        mass[list(cell.columns)] += np.exp(cell.log_evidence - cells[0].log_evidence)
+        weight[list(cell.columns)] += np.exp(cell.log_evidence - cells[0].log_evidence)
     whole = sum(np.exp(cell.log_evidence - cells[0].log_evidence) for cell in cells)
     best = [k for k in _best_of_kinds(problem, alone) if alone[k] > cells[0].log_evidence - _COARSE]
-    counts = {*best, *np.flatnonzero(mass > _COUNTS * whole).tolist()}
+    counts = {*best, *np.flatnonzero(weight > _COUNTS * whole).tolist()}
     return [k for k in sorted(counts) if problem.columns[k].widths]
 
 
 def _best_of_kinds(problem: Problem, alone: Float[np.ndarray, " column"]) -> list[int]:
-    """Of every kind the column that is most probable alone."""
+    """The column of every kind that is most probable alone."""
     best: dict[str, int] = {}
     for k in np.argsort(-alone, kind="stable").tolist():
         best.setdefault(problem.columns[k].kind, k)
@@ -75,35 +75,38 @@ def _best_of_kinds(problem: Problem, alone: Float[np.ndarray, " column"]) -> lis
 
 
 def hypotheses_of(problem: Problem) -> list[Cell]:
-    """The hypotheses of a problem that can count, the most probable first."""
-    return _weighed(problem)[0]
+    """The relevant hypotheses of a problem, the most probable first."""
+    return _compared(problem)[0]
 
 
 class _Grid(NamedTuple):
-    """Sums over rows for remainders of every size: of fundamentals, and of all other harmonics."""
+    """Sums over rows on the grid of remainders: of fundamentals, and of all other harmonics."""
 
     own: list[LawSums]
     higher: list[LawSums | None]
 
     @classmethod
     def of(cls, problem: Problem, every: int) -> "_Grid":
-        """With every size of remainders, or some: `every` second one."""
-        sizes = sizes_of_remainders(every)
+        """With each `every`-th standard deviation of the remainders."""
+        stds = remainder_stds(every)
         own, *others = problem.blocks
-        sums = [LawSums.of(problem.columns, own, s) for s in itertools.product(sizes, sizes)]
+        sums = [LawSums.of(problem.columns, own, s) for s in itertools.product(stds, stds)]
         return cls(sums, _of_harmonics(problem.columns, others, every))
 
-    def singles(self) -> Iterator[tuple[list[Sizes], np.ndarray, np.ndarray]]:
-        """Sizes, ln evidence without a law, and of every law alone, by combination of sizes."""
+    def singles(self) -> Iterator[tuple[list[RemainderStds], np.ndarray, np.ndarray]]:
+        """Remainders, and ln evidence without a law and of every law alone, by combination."""
         of_higher = HarmonicSums.of(self.higher)
         for own in self.own:
-            sizes = [own.sizes if one is None else (*own.sizes, *one.sizes) for one in self.higher]
-            yield sizes, *of_higher.singles(own)
+            stds = [
+                own.remainder_std if one is None else (*own.remainder_std, *one.remainder_std)
+                for one in self.higher
+            ]
+            yield stds, *of_higher.singles(own)
 
     def coarse(self) -> list[LawSums]:
-        """Of fundamentals, for the sizes that several laws are tried with."""
-        few = {*sizes_of_remainders(2)}
-        return [own for own in self.own if {*own.sizes} <= few]
+        """Sums of fundamentals on the coarser grid, for several laws."""
+        few = {*remainder_stds(2)}
+        return [own for own in self.own if {*own.remainder_std} <= few]
 
 
 def _log_evidence_of_singles(problem: Problem) -> float:
@@ -112,36 +115,36 @@ def _log_evidence_of_singles(problem: Problem) -> float:
     return float(logsumexp(np.concatenate(each)))
 
 
-def _weighed(
+def _compared(
     problem: Problem, every: int = 1, reach: float = _LEAST
 ) -> tuple[list[Cell], Float[np.ndarray, " column"]]:
-    """Hypotheses that can count, and ln evidence of every column alone with its best remainders.
+    """Relevant hypotheses, and ln evidence of every column alone with its best remainders.
 
-    With every size of remainders, or some: `every` second one. Down to `reach` below the most
-    probable, in nats.
+    With each `every`-th standard deviation of the remainders, and hypotheses within `reach` nats of
+    the most probable one.
     """
     grid = _Grid.of(problem, every)
     cells: list[Cell] = []
     alone = np.full(len(problem.columns), -np.inf)
-    for sizes, base, value in grid.singles():
+    for stds, base, value in grid.singles():
         alone = np.maximum(alone, np.max(value, axis=0, initial=-np.inf))
-        cells += [Cell(float(v), (), s) for v, s in zip(base, sizes, strict=True)]
+        cells += [Cell(float(v), (), s) for v, s in zip(base, stds, strict=True)]
         best = max(cell.log_evidence for cell in cells)
         for one, k in np.argwhere(value > best - reach).tolist():
-            cells.append(Cell(float(value[one, k]), (k,), sizes[one]))
+            cells.append(Cell(float(value[one, k]), (k,), stds[one]))
     best = max(cell.log_evidence for cell in cells)
     prior = grid.own[0].prior_of_pairs()
-    bounds = [0.0 if other is None else other.most() for other in grid.higher]
+    bounds = [0.0 if other is None else other.bound() for other in grid.higher]
     for own in grid.coarse():
-        most = own.most() + prior
+        upper = own.bound() + prior
         for other, bound in zip(grid.higher, bounds, strict=True):
-            places = np.nonzero(most + bound > best - reach)
-            if places[0].size:
+            pairs = np.nonzero(upper + bound > best - reach)
+            if pairs[0].size:
                 whole = own if other is None else own.with_rows_of(other)
-                some = whole.pairs(places[0], places[1], best - reach)
+                some = whole.pairs(pairs[0], pairs[1], best - reach)
                 best = max([best, *(cell.log_evidence for cell in some)])
                 cells += some
-    for n_laws in range(3, len(priors.SIZES)):
+    for n_laws in range(3, len(priors.EFFECT_COUNTS)):
         some = _with_one_more(cells, grid, n_laws, best - reach)
         cells += some
         if max((cell.log_evidence for cell in some), default=-np.inf) < best:
@@ -152,33 +155,37 @@ def _weighed(
 
 
 def _with_one_more(cells: list[Cell], grid: _Grid, n_laws: int, least: float) -> list[Cell]:
-    """The likeliest sets of one law less with every further law, where as probable as `least`.
+    """The best sets of one law less, each with every further law, where above `least`.
 
-    With remainders of every size: one law more may leave far less than the fewer do.
+    With all remainders: one law more may reduce the remainder by far.
     """
     fewer: dict[tuple[int, ...], Cell] = {}
     for cell in sorted(cells, key=lambda cell: -cell.log_evidence):
         if len(cell.columns) == n_laws - 1:
             fewer.setdefault(tuple(sorted(cell.columns)), cell)
-    found: dict[tuple[tuple[int, ...], Sizes], Cell] = {}
-    for one in itertools.islice(fewer.values(), _GONE_ON):
-        (other,) = (h for h in grid.higher if (() if h is None else h.sizes) == one.sizes[2:])
+    extended: dict[tuple[tuple[int, ...], RemainderStds], Cell] = {}
+    for one in itertools.islice(fewer.values(), _EXTENDED):
+        (other,) = (
+            h
+            for h in grid.higher
+            if (() if h is None else h.remainder_std) == one.remainder_std[2:]
+        )
         for own in grid.coarse():
             whole = own if other is None else own.with_rows_of(other)
             again = whole.together(one.columns)
             for cell in () if again is None else whole.with_one_more(again, least):
-                found.setdefault((tuple(sorted(cell.columns)), cell.sizes), cell)
-    return list(found.values())
+                extended.setdefault((tuple(sorted(cell.columns)), cell.remainder_std), cell)
+    return list(extended.values())
 
 
 def _of_harmonics(
     columns: list[Column], blocks: list[RowBlock], every: int
 ) -> "list[LawSums | None]":
-    """What counts of all other harmonics, for remainders of every combination of sizes."""
+    """Sums of all other harmonics, for all combinations of remainders."""
     if not blocks:
         return [None]
-    sizes = [(size,) for size in priors.HARMONIC_REMAINDERS[::every].tolist()]
-    each = [[LawSums.of(columns, block, size) for size in sizes] for block in blocks]
+    stds = [(std,) for std in priors.HARMONIC_REMAINDERS[::every].tolist()]
+    each = [[LawSums.of(columns, block, std) for std in stds] for block in blocks]
     return [
         functools.reduce(lambda one, other: one.with_rows_of(other), some)
         for some in itertools.product(*each)

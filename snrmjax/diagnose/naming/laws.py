@@ -1,8 +1,8 @@
-"""What every kind of effect changes in the readings, to first order: the library's laws.
+"""First-order change of the readings by every kind of effect in the library.
 
-Values are over ω₀² and functions of the amplitude over the largest one. Parameters that are not
-linear (a gap, an exponent) have a grid of values. Other harmonics are those of the force that the
-measured fundamental causes.
+Values are relative to ω₀², as functions of the amplitude over the largest one. Nonlinear parameters
+(a gap, an exponent) have a grid of values. Other harmonics are those of the force under the
+measured fundamental motion.
 """
 
 from collections.abc import Callable
@@ -54,34 +54,33 @@ from snrmjax.model.library.stiffness import (
 )
 from snrmjax.numerics.units import HERTZ
 
-# Over the largest amplitude; so fine that a kink between two of them is seen from both.
+# Over the largest amplitude; fine enough that neighbouring values show a corner between them.
 _GAPS = np.linspace(0.04, 0.96, 47)
 _STIFFNESSES = np.log([0.2, 2.0, 20.0])  # ln, of a stop, over ω₀²
-_QUADRATICS = np.log(
-    [0.003, 0.008, 0.02, 0.05, 0.12, 0.3]
-)  # ln, over ω₀² and the largest amplitude
+# ln, over ω₀² and the largest amplitude
+_QUADRATICS = np.log([0.003, 0.008, 0.02, 0.05, 0.12, 0.3])
 _BILINEARS = np.log([0.003, 0.01, 0.03, 0.1, 0.3])  # ln, over ω₀²
 _SLIPS = np.linspace(np.log(0.02), np.log(0.95), 47)  # ln, over the largest amplitude
 _EXPONENTS = np.linspace(1.1, 2.9, 10)
 _DETUNINGS = np.linspace(-0.04, 0.04, 9)
-_APART = np.array([-0.3, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.3])  # of a close mode
+_APART = np.array([-0.3, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.3])  # of a close mode, over ω₀
 _DAMPINGS = np.log([0.5, 2.0])  # ln, of a further mode, over the mode's own
 
 
 class Law(NamedTuple):
-    """What one kind of effect changes."""
+    """The change by one kind of effect."""
 
-    # Of the readings and a shape: the dynamic stiffness over ω₀².
+    # Change of the dynamic stiffness over ω₀², by readings and shape.
     change: Callable[..., Complex[np.ndarray, " state"]]
-    # Of the readings, one recorded harmonic and a shape: that harmonic of the force, alike.
+    # Harmonic of the force, likewise, by readings, one recorded harmonic and shape.
     higher: Callable[..., Complex[np.ndarray, " state"]] | None = None
     axes: tuple[np.ndarray, ...] = ()  # values of the shape
-    choices: tuple[float, ...] = ()  # of a last number of the shape, that is not divided
+    choices: tuple[float, ...] = ()  # discrete values of a last shape number, not refined
     sign: int = 0  # of the strength
-    std: float | None = None  # 1σ of the strength; None: any size
+    std: float | None = None  # 1σ of the strength; None: over `STRENGTHS`
     odds: float = 1.0  # over those of a law
     of_instrument: bool = False
-    # Parameters of the effect, in modal units, by the readings, strength and shape.
+    # Parameters of the effect in modal units, by readings, strength and shape.
     parameters: Callable[..., tuple[float, ...]] | None = None
 
 
@@ -93,12 +92,12 @@ def _stiffness(power: int) -> Change:
 
 
 def _damping(power: int, frequency_power: int) -> Change:
-    """Of a force ∝ a^(power + 1) Ω^frequency_power."""
+    """Damping by a force ∝ a^(power + 1) Ω^frequency_power."""
     return lambda r: 1j * r.relative_amplitude**power * r.relative_frequency**frequency_power
 
 
 def _of_force(force: Callable[..., np.ndarray]) -> Change:
-    """Harmonics of a force by displacement, velocity over ω₀ and shape."""
+    """Harmonics of a force of displacement, velocity over ω₀ and shape."""
 
     def higher(r: Readings, one: HarmonicReading, *shape: float) -> np.ndarray:
         omega = r.relative_frequency[:, None]
@@ -125,14 +124,14 @@ def _quadratic(r: Readings, log_s: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bilinear(r: Readings, log_k: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of k|q|/2, by the mean −ka/π and the second harmonic 2ka/(3π) that it causes."""
+    """Of k|q|/2, by the mean −ka/π and the second harmonic 2ka/(3π) of the motion."""
     k = np.exp(log_k)
     twice = 2 * k / (3 * np.pi) * np.ones_like(r.dynamic_stiffness)
     return -2 * (k / np.pi) ** 2 + twice**2 / (4 * r.relative_frequency**2 - 1), twice
 
 
 def _second_of(law: Callable[[Readings, float], tuple[np.ndarray, np.ndarray]]) -> Change:
-    """The second harmonic of an even law, of either side."""
+    """The second harmonic of an even law of either sign."""
 
     def higher(r: Readings, one: HarmonicReading, log_s: float, side: float) -> np.ndarray:
         return side * law(r, log_s)[1] * (one.order == 2)
@@ -158,7 +157,7 @@ def _resonance(order: int) -> Change:
 
 
 def _third_of_resonance(order: int) -> Change:
-    """n b qⁿ⁻¹ p, with p at n times the frequency, has its third harmonic n − 1 times as large."""
+    """Third harmonic of n b qⁿ⁻¹ p with p at n times the frequency: n − 1 times the change."""
     change = _resonance(order)
 
     def higher(r: Readings, one: HarmonicReading, *shape: float) -> np.ndarray:
@@ -168,7 +167,7 @@ def _third_of_resonance(order: int) -> Change:
 
 
 def _of_resonance(order: int) -> Callable[..., tuple[float, ...]]:
-    """Of the coupling b by n b² a²ⁿ⁻²/4ⁿ⁻¹, the change over that of a mode of stiffness ω₀²."""
+    """Coupling b from strength s = n b² a²ⁿ⁻²/(4ⁿ⁻¹ ω₀⁴) at the largest amplitude a."""
 
     def parameters(r: Readings, s: float, detuning: float, log_times: float) -> tuple[float, ...]:
         square = max(s, 0.0) * 4 ** (order - 1) / order
@@ -180,7 +179,7 @@ def _of_resonance(order: int) -> Callable[..., tuple[float, ...]]:
 
 
 def _close_mode(r: Readings, apart: float, log_times: float) -> np.ndarray:
-    """Of a mode at (1 + `apart`) ω₀ that the force drives too."""
+    """Change by a mode at (1 + `apart`) ω₀ driven by the same force."""
     own, omega = 1 + apart, r.relative_frequency
     ratio = np.exp(log_times) * max(r.damping_ratio, 1e-4)
     return _relative(r) ** 2 / (own**2 - omega**2 + 2j * ratio * own * omega)
@@ -191,7 +190,7 @@ def _relative(r: Readings) -> np.ndarray:
 
 
 def _larger_motion(r: Readings) -> np.ndarray:
-    """Of motions that are recorded too large, by a fraction: the state stands for a smaller one."""
+    """Change where motions are recorded too large by a fraction: −(Z + dZ/d ln a)."""
     return -(r.dynamic_stiffness + r.slope) / r.natural_frequency**2
 
 
@@ -351,4 +350,4 @@ LAWS: dict[str, Law] = {
         **_OF_GAIN,
     ),
 }
-"""Of every kind what it changes in the dynamic stiffness, over ω₀²."""
+"""Change of the dynamic stiffness over ω₀², by kind of effect."""

@@ -1,9 +1,9 @@
-"""What every state reads of a mode beyond its model: changes of stiffness and damping, whitened.
+"""Readings: every state's excess dynamic stiffness over the model, whitened.
 
-With X = V/(iΩ) and the modal constant A a state has the dynamic stiffness Z = FA/X of the mode.
-What it has beyond the model, Z − Z_model(a, Ω) = Σ θⱼhⱼ(a, Ω) + remainder + errors, is linear in
-all that is unknown. Slopes, noise and sizes of levels' errors are those of smooth curves through
-the states (`identify.test_model`); amplitudes are corrected for the errors that these find.
+With X = V/(iΩ) and the modal constant A, a state has the dynamic stiffness Z = FA/X of the mode.
+Its excess Z − Z_model(a, Ω) = Σ θⱼhⱼ(a, Ω) + remainder + errors is linear in all unknowns. Slopes,
+noise and level errors are those of smooth curves through the states (`identify.test_model`), and
+the amplitudes are corrected for the errors that these curves estimate.
 """
 
 from collections.abc import Callable
@@ -22,42 +22,42 @@ from snrmjax.model.effect_metadata import MotionScales
 
 
 class ModelMotion(NamedTuple):
-    """What a model has at a motion: as given, then with each stated parameter moved by its 1σ."""
+    """A model's prediction at a motion: as given, then with each stated parameter shifted by 1σ."""
 
     dynamic_stiffness: Complex[np.ndarray, "model state"]  # Z, 1/s²
     harmonics: Complex[np.ndarray, "model state order"]  # of the velocity, m/s, as recorded
 
 
 MotionOfModel = Callable[[Complex[np.ndarray, " state"], Float[np.ndarray, " state"]], ModelMotion]
-"""That of velocities (m/s) and frequencies (rad/s) of the mode alone."""
+"""Prediction for velocities (m/s) and frequencies (rad/s) of the mode alone."""
 
 
 class RecordedHarmonics(NamedTuple):
-    """Other harmonics that the reference sensor recorded."""
+    """Other harmonics recorded at the reference sensor."""
 
     order: tuple[int, ...]
     velocity: Complex[np.ndarray, "state order"]  # m/s
     std: Float[np.ndarray, "state order"]  # 1σ of each part, m/s; NaN where not recorded
-    forced: Complex[np.ndarray, "state order"]  # m/s, of such a harmonic as large as the force
+    forced: Complex[np.ndarray, "state order"]  # m/s, by an exciter harmonic as large as the force
 
 
 class HarmonicReading(NamedTuple):
-    """A harmonic of the force that a motion x cos t needs beyond the model: cₕ/x, 1/s²."""
+    """Excess harmonic of the force over the model, for a motion x cos t: cₕ/x, 1/s²."""
 
     order: int
     beyond: Complex[np.ndarray, " state"]
     weight: Float[np.ndarray, " state"]  # 1 over the 1σ of each part; 0 where not recorded
-    forced: Complex[np.ndarray, " state"]  # by a harmonic of the exciter as large as the force
-    errors: Complex[np.ndarray, "error state"]  # of the model's parameters, by their own 1σ
+    forced: Complex[np.ndarray, " state"]  # by an exciter harmonic as large as the force
+    errors: Complex[np.ndarray, "error state"]  # by 1σ of each of the model's parameters
 
     def whitened(self, change: Complex[np.ndarray, "*several state"]) -> np.ndarray:
-        """Changes (1/s²) as the rows show them, (…, row)."""
+        """Changes (1/s²) whitened to rows, (…, row)."""
         parts = np.stack([np.real(change), np.imag(change)], axis=-1) * self.weight[:, None]
         return parts.reshape(*parts.shape[:-2], 2 * len(self.weight))
 
 
 class LinearTest(NamedTuple):
-    """The linear mode, and 1σ of what was stated of it."""
+    """The linear mode, with stated 1σ."""
 
     natural_frequency: float  # rad/s
     damping_ratio: float
@@ -65,8 +65,8 @@ class LinearTest(NamedTuple):
     damping_std: float
     mass_std: float  # relative
     shape: float  # of the mode at the sensor, kg^-1/2
-    side: float  # −1 where the sensor moves against the force, whose states are turned; else 1
-    scales: MotionScales  # of the motions that were measured
+    side: float  # sign of shape × participation; states with −1 are sign-changed
+    scales: MotionScales  # of the measured motions
 
 
 class Readings(NamedTuple):
@@ -76,13 +76,13 @@ class Readings(NamedTuple):
     velocity: Complex[np.ndarray, " state"]  # m/s, of the mode, corrected
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N
-    order: Float[np.ndarray, " state"]  # place in the test, 0 to 1
+    order: Float[np.ndarray, " state"]  # position in the test, 0 to 1
     dynamic_stiffness: Complex[np.ndarray, " state"]  # Z, 1/s²
-    slope: Complex[np.ndarray, " state"]  # dZ/d ln a by smooth curves
-    root: Float[np.ndarray, "state 2 2"]  # whitens real and imaginary part of Z
+    slope: Complex[np.ndarray, " state"]  # dZ/d ln a of smooth curves
+    root: Float[np.ndarray, "state 2 2"]  # whitening of real and imaginary part of Z
     beyond: Complex[np.ndarray, " state"]  # Z less that of the model, 1/s²
     rows: Float[np.ndarray, " row"]  # Z less that of the model, whitened
-    errors: Float[np.ndarray, "row error"]  # of levels, modal mass, linear test: by their own 1σ
+    errors: Float[np.ndarray, "row error"]  # by 1σ of modal mass, linear test, levels
     posterior: TestPosterior
     harmonics: tuple[HarmonicReading, ...] = ()
 
@@ -118,7 +118,7 @@ class Readings(NamedTuple):
 
     @property
     def relative_amplitude(self) -> Float[np.ndarray, " state"]:
-        """Over the largest one."""
+        """Amplitudes over the largest one."""
         return self.amplitude / np.max(self.amplitude)
 
     @property
@@ -129,7 +129,7 @@ class Readings(NamedTuple):
     def whitened(
         self, change: Complex[np.ndarray, "*several state"]
     ) -> Float[np.ndarray, "*several row"]:
-        """Changes of Z (1/s²) as the rows show them."""
+        """Changes of Z (1/s²) whitened to rows."""
         parts = np.stack([np.real(change), np.imag(change)], axis=-1)
         white = np.einsum("nij,...nj->...ni", self.root, parts)
         return white.reshape(*white.shape[:-2], -1)
@@ -144,53 +144,53 @@ def readings_of(
     *,
     phases_known: bool = True,
 ) -> Readings:
-    """The readings of a test's states, beyond a model.
+    """The readings of a test's states, in excess of a model.
 
-    Where phases are not known (`phases_known`) they come from smooth curves: residuals of
-    neighbouring states are then alike by themselves, and say nothing of a scatter of the frequency.
+    Phases that are not known (`phases_known`) come from smooth curves: residuals of neighbouring
+    states are then correlated by construction and do not show a scatter of the frequency.
     """
-    # Curves may go with the forcing frequency too.
+    # Curves may depend on the forcing frequency too.
     states = states._replace(off_resonance_std=OFF_RESONANCE)
-    found = fit_test(
+    posterior = fit_test(
         states, compare_levels=False, power_likelihood=phases_known, parts_of_noise=phases_known
     )
-    states = found.states
+    states = posterior.states
     balance = Balance(
-        *(states, found.terms, found.places, found.weight),
+        *(states, posterior.terms, posterior.layout, posterior.weight),
         np.zeros((len(states.level), 0), complex),
     )
-    now, omega = balance.at(found.mean, found.corrections), states.frequency
+    now, omega = balance.at(posterior.mean, posterior.corrections), states.frequency
     slopes = now.by_error
-    std = found.hyper.noise * states.errors
+    std = posterior.hyper.noise * states.errors
     std[:, 1:3] = np.hypot(std[:, 1:3], priors.FLOOR)
-    std = std / np.sqrt(found.fraction)
-    root, _ = whitening(slopes, std, found.weight)
-    # Records less the model's, by their straight line about the corrected motion.
+    std = std / np.sqrt(posterior.fraction)
+    root, _ = whitening(slopes, std, posterior.weight)
+    # Measured less model Z, linearised about the corrected motion.
     motion = model(now.velocity, omega)
-    known, *moved = motion.dynamic_stiffness
-    rows = now.z - known - np.sum(slopes * found.corrections, axis=1)
-    rows = rows - 1j * now.z * found.mean[PHASE]
+    known, *shifted = motion.dynamic_stiffness
+    rows = now.z - known - np.sum(slopes * posterior.corrections, axis=1)
+    rows = rows - 1j * now.z * posterior.mean[PHASE]
     of_gain = now.z if states.force_is_free else -now.z - now.slope
     linear_stiffness = linear.natural_frequency**2 * np.ones_like(now.z)
     of_levels = (of_gain, -1j * now.z, linear_stiffness, now.damping)
-    columns = [linear.mass_std * now.model / (1 + found.mean[MASS])]
+    columns = [linear.mass_std * now.model / (1 + posterior.mean[MASS])]
     natural = linear.natural_frequency
     columns.append(2 * natural * linear.frequency_std * np.ones_like(now.z))
     columns.append(2j * omega * natural * linear.damping_std)
-    sizes = np.hypot(found.hyper.level_std, [priors.FLOOR, priors.FLOOR, 0.0, 0.0])
-    columns += [one - known for one in moved]
-    for kind, (column, size) in enumerate(zip(of_levels, sizes, strict=True)):
-        if kind < 2:  # of which the records were corrected
-            rows = rows + column * found.level_errors[states.level, kind]
-        # Of which the standard deviation is that of differences: a gain or a phase that all levels
-        # have in common is one of the instruments where it is much larger.
-        columns += [size * column * (states.level == k) for k in range(states.n_levels)]
-    for k, size in enumerate(OFF_RESONANCE):
-        columns.append(size * now.with_frequency[:, k])
+    level_stds = np.hypot(posterior.hyper.level_std, [priors.FLOOR, priors.FLOOR, 0.0, 0.0])
+    columns += [one - known for one in shifted]
+    for kind, (column, level_std) in enumerate(zip(of_levels, level_stds, strict=True)):
+        if kind < 2:  # gain and phase: restore the corrections of the records
+            rows = rows + column * posterior.level_errors[states.level, kind]
+        # `level_std` is that of differences between levels: a much larger common gain or phase is
+        # an instrument error.
+        columns += [level_std * column * (states.level == k) for k in range(states.n_levels)]
+    for k, std_off in enumerate(OFF_RESONANCE):
+        columns.append(std_off * now.with_frequency[:, k])
     none, slope = np.empty(0), now.slope
     bare = Readings(
         *(linear, now.velocity, omega, now.force, order, now.z, slope, root, rows, none, none),
-        posterior=found,
+        posterior=posterior,
     )
     higher = () if recorded is None else _higher(linear, states, now.velocity, motion, recorded)
     return bare._replace(
@@ -205,25 +205,25 @@ def _higher(
     motion: ModelMotion,
     recorded: RecordedHarmonics,
 ) -> tuple[HarmonicReading, ...]:
-    """Harmonics of the force by those of the motion, which the linear mode answers.
+    """Harmonics of the force from those of the motion, by the linear mode's dynamic stiffness.
 
-    An error of a state's phase is one of time: it turns the fundamental alike.
+    A phase error of a state is a time shift: harmonics are taken relative to the fundamental.
     """
     omega, natural = states.frequency, linear.natural_frequency
     mode = linear.side * velocity / (1j * omega * linear.shape)
-    found = []
-    for place, order in enumerate(recorded.order):
+    readings = []
+    for index, order in enumerate(recorded.order):
         driven = order * omega
         stiffness = natural**2 - driven**2 + 2j * linear.damping_ratio * natural * driven
-        turn = (np.abs(mode) / mode) ** order
-        unit = -stiffness / (1j * driven * linear.shape) * turn / np.abs(mode)
-        model, *moved = unit * motion.harmonics[:, :, place]
-        beyond = unit * recorded.velocity[:, place] - model
-        std = np.hypot(np.abs(unit) * recorded.std[:, place], priors.HARMONIC * np.abs(beyond))
+        rotation = (np.abs(mode) / mode) ** order
+        unit = -stiffness / (1j * driven * linear.shape) * rotation / np.abs(mode)
+        model, *shifted = unit * motion.harmonics[:, :, index]
+        beyond = unit * recorded.velocity[:, index] - model
+        std = np.hypot(np.abs(unit) * recorded.std[:, index], priors.HARMONIC * np.abs(beyond))
         there = np.isfinite(std) & (std > 0)
         weight = np.where(there, 1 / np.where(there, std, 1.0), 0.0)
-        forced = unit * recorded.forced[:, place]
-        errors = np.array([one - model for one in moved]).reshape(-1, len(omega))
+        forced = unit * recorded.forced[:, index]
+        errors = np.array([one - model for one in shifted]).reshape(-1, len(omega))
         beyond = np.where(there, beyond, 0.0)
-        found.append(HarmonicReading(order, beyond, weight, forced, errors))
-    return tuple(found)
+        readings.append(HarmonicReading(order, beyond, weight, forced, errors))
+    return tuple(readings)

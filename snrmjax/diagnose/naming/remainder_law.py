@@ -1,4 +1,4 @@
-"""A remainder as a force: the law whose describing function it is, for a completed model."""
+"""The force law whose describing function is a remainder, for a completed model."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +10,13 @@ from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
 
 _KNOTS = 16
 _ANGLES = 200
-_SMOOTH = 1e-4  # of the values: second differences are kept small where data say nothing
+_SMOOTH = 1e-4  # weight of second differences, for knots that data do not determine
 
 
 def remainder_laws(
     problem: Problem, remainders: dict[str, Remainder]
 ) -> list[StiffnessLaw | DisplacementDampingLaw]:
-    """The forces of remainders, by part, on the mode of interest."""
+    """The forces of the remainders of each part, on the mode of interest."""
     readings = problem.readings
     laws: list[StiffnessLaw | DisplacementDampingLaw] = []
     natural, largest = readings.natural_frequency, readings.largest
@@ -39,9 +39,9 @@ def _secants(
     *,
     in_phase: bool,
 ) -> Float[np.ndarray, " knot"]:
-    """Secants s at knots with the mean of 2 s(a |cos t|) cos² t, or sin² t, as it is at amplitudes.
+    """Secants s at knots for which the mean of 2 s(a |cos t|) cos² t, or sin² t, is `value` at a.
 
-    By least squares of straight lines over ln q, with second differences kept small.
+    By regularised least squares, piecewise linear in ln q.
     """
     t = (np.arange(_ANGLES) + 0.5) * 0.5 * np.pi / _ANGLES
     weight = 2 * (np.cos(t) ** 2 if in_phase else np.sin(t) ** 2) / _ANGLES

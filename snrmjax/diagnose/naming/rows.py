@@ -1,6 +1,6 @@
-"""Rows that a test's laws explain: fundamentals and every other harmonic, made triangular once.
+"""Linear problem of a test: blocks of rows of the fundamentals and of every other harmonic.
 
-Fundamentals and every other harmonic are blocks of rows that have nothing but the laws in common.
+The blocks share only the laws. Each is orthogonalised once (QR) for all hypotheses.
 """
 
 from typing import NamedTuple
@@ -13,35 +13,35 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column
 from snrmjax.diagnose.naming.readings import Readings
 
-_KNOTS_A_UNIT = 8  # of ln a
+_KNOTS_A_UNIT = 8  # knots per unit of ln a
 _MOST_KNOTS = 40
-_NO_VARIANCE = 1e-8  # of the largest: a function of the remainder that adds nothing
+_NO_VARIANCE = 1e-8  # of the largest: functions of the remainder below it are left out
 
 CURVES = "stiffness", "damping"
 """Parts that are curves of amplitude; the others are harmonics."""
 
-Sizes = tuple[float, ...]
+RemainderStds = tuple[float, ...]
 
 
 class Cell(NamedTuple):
-    """One hypothesis: some columns with remainders of some sizes."""
+    """One hypothesis: some columns, with given standard deviations of the remainders."""
 
-    log_evidence: float  # times the prior
-    columns: tuple[int, ...]  # places in `Problem.columns`
-    sizes: Sizes  # σ of the remainders of stiffness, damping and every other harmonic
+    log_evidence: float  # ln of evidence times prior
+    columns: tuple[int, ...]  # indices in `Problem.columns`
+    remainder_std: RemainderStds  # of stiffness, damping and every other harmonic
 
 
 class RowBlock(NamedTuple):
-    """Rows that have errors and remainders of their own, made triangular once."""
+    """Rows with their own errors and remainders, and the QR decomposition of these."""
 
     rows: Float[np.ndarray, " row"]
-    design: Float[np.ndarray, "row unknown"]  # errors, then remainders of size 1
-    groups: tuple[int, ...]  # how many unknowns are errors, and functions of every remainder
-    directions: Float[np.ndarray, "row direction"]  # of the design, orthogonal
+    design: Float[np.ndarray, "row unknown"]  # errors, then remainder functions of unit variance
+    groups: tuple[int, ...]  # numbers of errors, and of functions of every remainder
+    directions: Float[np.ndarray, "row direction"]  # Q of the design
     triangle: Float[np.ndarray, "direction unknown"]
     laws: Float[np.ndarray, "row column"]
-    along: Float[np.ndarray, "direction column"]  # laws and, last, the rows
-    across: Float[np.ndarray, "column column"]  # Gram matrix of what is left of them
+    along: Float[np.ndarray, "direction column"]  # Qᵀ times the laws and, last, the rows
+    across: Float[np.ndarray, "column column"]  # Gram matrix of their parts orthogonal to Q
 
     @classmethod
     def of(
@@ -57,38 +57,38 @@ class RowBlock(NamedTuple):
         return cls(rows, design, groups, *np.linalg.qr(design), none, none, none)
 
     def with_laws(self, laws: Float[np.ndarray, "row column"]) -> "RowBlock":
-        """The same with the columns of laws."""
+        """The block with the columns of laws."""
         both = np.column_stack([laws, self.rows])
         along = self.directions.T @ both
         left = both - self.directions @ along
         return self._replace(laws=laws, along=along, across=left.T @ left)
 
-    def variances(self, sizes: Sizes) -> Float[np.ndarray, " unknown"]:
+    def variances(self, remainder_std: RemainderStds) -> Float[np.ndarray, " unknown"]:
         """Prior variances of the design's unknowns."""
-        return np.repeat([1.0, *(size**2 for size in sizes)], self.groups)
+        return np.repeat([1.0, *(std**2 for std in remainder_std)], self.groups)
 
 
 class Problem(NamedTuple):
-    """Rows, and what can explain them."""
+    """All rows with their errors, laws and remainders."""
 
     readings: Readings
     columns: list[Column]
-    functions: dict[str, Float[np.ndarray, "state function"]]  # of every part's remainder of size 1
+    functions: dict[str, Float[np.ndarray, "state function"]]  # of remainders of unit variance
     blocks: tuple[RowBlock, ...]  # fundamentals, then every other harmonic
-    length: float  # of ln a, over which remainders of stiffness and damping change
+    length: float  # correlation length in ln a of the remainders of stiffness and damping
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """What of the test may have a remainder."""
+        """The parts of the test that may have a remainder."""
         return tuple(self.functions)
 
     def with_columns(self, columns: list[Column]) -> "Problem":
-        """The same with other columns."""
+        """The problem with other columns."""
         readings = self.readings
         unit = readings.natural_frequency**2
         laws = [readings.whitened(unit * np.array([column.change for column in columns])).T]
-        for place, one in enumerate(readings.harmonics):
-            higher = np.array([column.higher[place] for column in columns])
+        for index, one in enumerate(readings.harmonics):
+            higher = np.array([column.higher[index] for column in columns])
             laws.append(one.whitened(unit * higher).T)
         blocks = [block.with_laws(own) for block, own in zip(self.blocks, laws, strict=True)]
         return self._replace(columns=columns, blocks=tuple(blocks))
@@ -100,7 +100,7 @@ class Problem(NamedTuple):
 
 
 def problem_of(readings: Readings, columns: list[Column], length: float) -> Problem:
-    """The problem, made triangular once for all hypotheses."""
+    """The linear problem, decomposed once for all hypotheses."""
     x, natural = readings.relative_amplitude, readings.natural_frequency
     functions = {part: _of_curves(x, x, length) for part in CURVES}
     curves = natural**2 * functions[CURVES[0]].T
@@ -118,9 +118,9 @@ def problem_of(readings: Readings, columns: list[Column], length: float) -> Prob
 def _of_curves(
     measured: Float[np.ndarray, " state"], at: Float[np.ndarray, " point"], length: float
 ) -> Float[np.ndarray, "point function"]:
-    """Functions of stiffness or damping, about their means over the states.
+    """Functions of stiffness or damping, less their means over the states.
 
-    A constant is the linear mode's, whose errors and changes have columns of their own.
+    A constant belongs to the linear mode, whose errors and changes have their own columns.
     """
     constant = np.mean(_functions(measured, measured, length), axis=0)
     return _functions(measured, at, length) - constant
@@ -137,7 +137,7 @@ def _of_harmonic(
 def _functions(
     measured: Float[np.ndarray, " state"], at: Float[np.ndarray, " point"], length: float
 ) -> Float[np.ndarray, "point function"]:
-    """Independent functions of unit variance whose sum is a Matérn 5/2 process in ln a."""
+    """Basis functions whose sum with N(0, 1) weights is a Matérn 5/2 process in ln a."""
     low = float(np.log(np.min(measured)))
     knots = np.linspace(low, 0.0, int(min(_MOST_KNOTS, 8 - _KNOTS_A_UNIT * low)))
     values, vectors = np.linalg.eigh(_matern(knots, knots, length))
@@ -152,26 +152,30 @@ def _matern(u: np.ndarray, v: np.ndarray, length: float) -> np.ndarray:
 
 
 class Solved(NamedTuple):
-    """Most likely strengths of a hypothesis' laws and its remainders, with their covariance."""
+    """Posterior mean and covariance of a hypothesis' strengths and remainders."""
 
     mean: Float[np.ndarray, " unknown"]  # strengths, then the remainders' functions, part by part
     covariance: Float[np.ndarray, "unknown unknown"]
-    misfit: float  # root-mean-square of what is left of the rows
-    of_fundamentals: float  # that of the fundamentals' rows
+    misfit: float  # rms residual of the rows
+    of_fundamentals: float  # rms residual of the fundamentals' rows
     linear: tuple[float, float]  # errors of the natural frequency and damping ratio, in their 1σ
 
 
 def solved(problem: Problem, cell: Cell) -> Solved:
-    """The unknowns of a hypothesis; a law's strength has no prior but what an instrument's has."""
+    """Posterior of a hypothesis, with N(0, 1) priors of strengths and of errors."""
     laws, blocks = list(cell.columns), problem.blocks
     design = block_diag(*(block.design for block in blocks))
     design = np.hstack([np.vstack([block.laws[:, laws] for block in blocks]), design])
     rows = np.concatenate([block.rows for block in blocks])
-    variances = [np.ones(len(laws))]  # what is seen at all is far smaller
+    variances = [np.ones(len(laws))]  # strengths of laws are far smaller: a flat prior
     kept, first = [np.ones(len(laws), bool)], 2
-    for place, block in enumerate(blocks):
-        sizes = cell.sizes[:first] if place == 0 else cell.sizes[first + place - 1 :][:1]
-        variances.append(block.variances(sizes))
+    for index, block in enumerate(blocks):
+        stds = (
+            cell.remainder_std[:first]
+            if index == 0
+            else cell.remainder_std[first + index - 1 :][:1]
+        )
+        variances.append(block.variances(stds))
         kept.append(np.repeat([False, True], [block.groups[0], sum(block.groups[1:])]))
     root, remain = np.sqrt(np.concatenate(variances)), np.concatenate(kept)
     q, r = np.linalg.qr(np.vstack([design * root, np.eye(len(root))]))

@@ -1,4 +1,4 @@
-"""Numbers of a structure fitted to points of its backbone: dimensions, moduli, supports."""
+"""Parameters of a structure fitted to points of its backbone: dimensions, moduli, supports."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -20,28 +20,28 @@ from snrmjax.numerics.result import Variable, quantity
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.solutions.mode_at_velocities import normal_mode_at_velocities
 
-_FURTHEST = np.log(10.0)  # of a number from its start, either way
+_LARGEST_LOG_CHANGE = np.log(10.0)  # of a parameter from its starting value, up or down
 _RULE = StepRule(steps=200, settled=1e-6)
-_ROUNDS = 3  # of fitting, and of weighing the errors of velocity by the slope that was found
+_ROUNDS = 3  # fits, each weighted with the slope dω/dv of the previous one
 
 ModelOf = Callable[[dict[str, Any]], Structure]
-"""A model by the values of named numbers, differentiable by them."""
+"""Builds a model from parameter values by name, differentiable with respect to them."""
 
 
 class MeasuredBackbone(NamedTuple):
-    """Points of a backbone: natural frequencies at amplitudes of velocity at the first sensor."""
+    """Points of a backbone: natural frequency against velocity amplitude at the first sensor."""
 
     velocity: Float[np.ndarray, " point"]  # m/s
     frequency: Float[np.ndarray, " point"]  # rad/s
-    frequency_std: Float[np.ndarray, " point"] | None = None  # rad/s; None: not known, all equal
+    frequency_std: Float[np.ndarray, " point"] | None = None  # rad/s; None: unknown, equal for all
     velocity_std: Float[np.ndarray, " point"] | None = None  # m/s; None: known exactly
 
 
 class BackboneCalibration(AbstractCalibration):
-    """Numbers of a structure with which it has a measured backbone; see `calibrate_to_backbone`.
+    """Parameters of a structure fitted to a measured backbone; see `calibrate_to_backbone`.
 
-    `residuals` are (measured − fitted frequency) over 1σ. `fitted_std` is 1σ of the fitted backbone
-    that follows from `covariance`.
+    `residuals` are (measured − fitted frequency) over 1σ. `fitted_std` is 1σ of the fitted
+    backbone, propagated from `covariance`.
     """
 
     measured: MeasuredBackbone
@@ -71,12 +71,12 @@ class BackboneCalibration(AbstractCalibration):
 
 
 class _Linear(NamedTuple):
-    """The weighted problem at some unknowns."""
+    """The weighted least-squares problem, linearised at the current unknowns."""
 
     residuals: Float[np.ndarray, " row"]
     jacobian: Float[np.ndarray, "row unknown"]
     frequency: Float[np.ndarray, " point"]
-    slope: Float[np.ndarray, " point"]  # of the frequency by the velocity
+    slope: Float[np.ndarray, " point"]  # dω/dv
 
 
 @on_numbers("Differentiate `sj.simulate.normal_mode_at_velocities`.")
@@ -89,26 +89,26 @@ def calibrate_to_backbone(
     harmonic_order: int = 5,
     steps: int = 4,
 ) -> BackboneCalibration:
-    """Fit numbers of a structure, such as dimensions or support stiffnesses, to its backbone.
+    """Fit parameters of a structure, such as dimensions or support stiffnesses, to its backbone.
 
     Minimises Σ((ω_k − ω(v_k; p))/σ_k)² + Σ((p − p₀)/σ_p)², where ω(v; p) is the frequency of the
-    nonlinear normal mode of `model_of(p)` at the velocity amplitude v, and σ_k² that of the
-    frequency and of the velocity times dω/dv. Levenberg–Marquardt in log p, with exact derivatives
-    through everything that `model_of` does.
+    nonlinear normal mode of `model_of(p)` at the velocity amplitude v, and σ_k² is the variance of
+    the frequency plus (dω/dv)² times that of the velocity. Levenberg–Marquardt in log p, with exact
+    derivatives through `model_of`.
 
-    Arguments: `model_of` makes a model of values by name, in JAX: `sj.io.read_beam_models` does it
-    from a beam file; `start` has the values to begin with (positive, SI units), which also says
-    what is fitted; `measured` points of a backbone, or identified ones; `prior_std` 1σ with which
-    starting values are known beforehand, for those of which the backbone alone says too little.
-    Returns a `BackboneCalibration`; its status and notes say where a fit did not converge.
-    Raises `ValueError` for a start that is not positive, for measured numbers that are no backbone,
-    for fewer data than parameters and for an unknown name in `prior_std`.
-    Validity: the first sensor of the model is the one that was measured. Values stay within a
-    factor of ten of their start. Standard deviations are linearised: a number that is known to
-    worse than a tenth may lie several of them off. A backbone of one mode tells about its linear
-    frequency, softening and hardening, as far as it was measured: two or three numbers, not more.
+    Arguments: `model_of` builds a model from parameter values by name, in JAX (for a beam file:
+    `sj.io.read_beam_models`); `start` names the parameters to fit and their starting values
+    (positive, SI units); `measured` backbone points, measured or identified; `prior_std` prior 1σ
+    of starting values, for parameters that the backbone alone does not determine.
+    Returns a `BackboneCalibration`; its status and notes report a fit that did not converge.
+    Raises `ValueError` for a start that is not positive, for measured values that are not finite
+    and positive, for fewer data than parameters and for an unknown name in `prior_std`.
+    Validity: the model's first sensor is the measured one. Values stay within a factor of ten of
+    their start. Standard deviations are linearised: with 1σ above 10 % the error may be several σ.
+    The backbone of one mode determines its linear frequency, softening and hardening over the
+    measured range: two or three parameters, not more.
     Not differentiable: differentiate `snrmjax.simulate.normal_mode_at_velocities`.
-    Reference: for errors of both coordinates ("effective variance") J. Orear, Am. J. Phys. 50
+    Reference: errors in both coordinates ("effective variance"): J. Orear, Am. J. Phys. 50
     (1982) 912, doi:10.1119/1.12972.
     """
     names = tuple(start)
@@ -129,25 +129,25 @@ def calibrate_to_backbone(
     prior = np.array([priors.get(name, np.inf) for name in names])
     settings = names, harmonic_order, steps
 
-    def sizes(slope: np.ndarray) -> np.ndarray:
-        """1σ of every point's frequency."""
+    def residual_std(slope: np.ndarray) -> np.ndarray:
+        """1σ of every residual: frequency error and velocity error times slope."""
         frequency_std = np.ones(n) if points.frequency_std is None else points.frequency_std
         across = 0.0 if points.velocity_std is None else slope * points.velocity_std
         return np.hypot(frequency_std, across)
 
     def linear(unknown: np.ndarray, sigma: np.ndarray | None) -> _Linear:
         values = begin * np.exp(unknown)
-        modal = _told(model_of, settings, values, points.velocity)
+        modal = _mode_frequencies(model_of, settings, values, points.velocity)
         frequency, by_value, slope = (np.asarray(part) for part in modal)
-        sigma = sizes(slope) if sigma is None else sigma
+        sigma = residual_std(slope) if sigma is None else sigma
         rows = (frequency - points.frequency) / sigma, (values - begin) / prior
         slopes = by_value * values / sigma[:, None], np.diag(values / prior)
         return _Linear(np.concatenate(rows), np.concatenate(slopes), frequency, slope)
 
     unknown = np.zeros(len(names))
-    limits = np.full(len(names), -_FURTHEST), np.full(len(names), _FURTHEST)
+    limits = np.full(len(names), -_LARGEST_LOG_CHANGE), np.full(len(names), _LARGEST_LOG_CHANGE)
     for _ in range(_ROUNDS if points.velocity_std is not None else 1):
-        sigma = sizes(linear(unknown, None).slope)
+        sigma = residual_std(linear(unknown, None).slope)
 
         def evaluate(trials: np.ndarray, sigma: np.ndarray = sigma) -> list[_Linear]:
             return [linear(trial, sigma) for trial in trials]
@@ -158,13 +158,13 @@ def calibrate_to_backbone(
 
 
 @compiled
-def _told(
+def _mode_frequencies(
     model_of: ModelOf,
     settings: tuple[tuple[str, ...], int, int],
     values: Float[Array, " parameter"],
     velocity: Float[Array, " point"],
 ) -> tuple[Array, Array, Array]:
-    """Frequencies of the mode (rad/s), their derivatives by the values and by the velocities."""
+    """Modal frequencies (rad/s), and their derivatives with respect to values and velocities."""
     names, harmonic_order, steps = settings
 
     def frequency(values: Array, shift: Array) -> tuple[Array, Array]:
@@ -174,13 +174,13 @@ def _told(
         )
         return modes.frequency, modes.frequency
 
-    # One motion does not feel another's velocity: all may be shifted at once.
+    # Each frequency depends on its own velocity only: one common shift gives every dω/dv.
     by, frequencies = jax.jacfwd(frequency, argnums=(0, 1), has_aux=True)(values, jnp.zeros(()))
     return frequencies, *by
 
 
 def _checked(measured: MeasuredBackbone | BackbonePoints) -> MeasuredBackbone:
-    """Points that are numbers, in the order in which they came."""
+    """The points as checked arrays, in their original order."""
     if isinstance(measured, BackbonePoints):
         solved = np.asarray(measured.status) == int(PointStatus.OK)
         std = np.asarray(measured.natural_frequency_std)[solved]
@@ -217,7 +217,7 @@ def _chosen(names: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:
 def _of_parameters(
     names: tuple[str, ...], which: np.ndarray, prior: np.ndarray
 ) -> dict[str, tuple[str, ...] | bool]:
-    """Some parameters, and whether starting values of all are known to `prior`."""
+    """The selected parameters, and whether all of them have a prior."""
     stated = bool(np.all(np.isfinite(prior[which])))
     return {"names": _chosen(names, which), "prior_stated": stated}
 
@@ -252,7 +252,7 @@ def _outcome(
         notes.append(Fact("no_mode_at_start"))
     elif not end.status.found_minimum:
         notes.append(Fact("calibration_not_converged"))
-    at_limit = np.abs(np.abs(end.point) - _FURTHEST) < 1e-9
+    at_limit = np.abs(np.abs(end.point) - _LARGEST_LOG_CHANGE) < 1e-9
     if at_limit.any():
         notes.append(Fact("parameters_at_limit", **_of_parameters(names, at_limit, prior)))
     by_value = linear.jacobian[:n] * sigma[:, None] / values

@@ -1,4 +1,4 @@
-"""What a calibration finds: a model with fitted parameters, and how well they are known."""
+"""Result of a calibration: a model with fitted parameters and their covariance."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -14,10 +14,10 @@ from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 
 
 class AbstractCalibration(AbstractResult):
-    """A model with fitted parameters, and how well they are known.
+    """A model with fitted parameters and their covariance.
 
-    `covariance` and `std` are widened by the residuals' size where no noise is stated, or where the
-    residuals contradict it.
+    `covariance` and `std` are scaled by the reduced χ² where no noise is stated, or where the
+    residuals contradict the stated noise.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("parameter",)
@@ -41,7 +41,7 @@ class AbstractCalibration(AbstractResult):
 
     @property
     def noise_scale(self) -> float:
-        """The residuals over the stated noise: the root of the reduced χ²."""
+        """Rms residual over the stated noise: the root of the reduced χ²."""
         return float(np.sqrt(self.reduced_chi_square))
 
     @property
@@ -51,7 +51,7 @@ class AbstractCalibration(AbstractResult):
 
     @abstractmethod
     def data_in_words(self) -> str:
-        """How many data of what kind were used."""
+        """Number and kind of the data used."""
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
@@ -75,8 +75,8 @@ class CalibratedModel(AbstractCalibration):
 
     `residuals` are whitened: of unit variance if noise and model are right; NaN where nothing was
     measured or the state has no weight. A state's columns are real and imaginary parts of the
-    force, of the other sensors' fundamentals and of the harmonics. What a level shares is by how
-    much its velocities were found to be too large and to lead.
+    force, of the other sensors' fundamentals and of the harmonics. `level_gain` and `level_phase`
+    are the fitted errors common to all velocities of a level.
     """
 
     residuals: Float[np.ndarray, "state column"] = quantity(

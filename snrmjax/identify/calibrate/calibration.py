@@ -1,9 +1,9 @@
 """Parameters of a model fitted to measured steady states, by inverse harmonic balance.
 
-A steady state is not simulated at its force and frequency, where near a fold there are several
-answers or none. Its frequency and the fundamental of its velocity are prescribed as measured, and
-the harmonic balance is solved for the rest of the motion and for the force: single-valued through
-folds. The residual is the difference of that force from the measured one.
+Simulating a steady state at its force and frequency can give several responses, or none, near a
+fold. Instead, its frequency and the fundamental of its velocity are prescribed as measured, and the
+harmonic balance is solved for the rest of the motion and for the force: single-valued through
+folds. The residual is the difference between that force and the measured one.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,10 @@ import numpy as np
 
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns, calibration_states
-from snrmjax.identify.calibrate.held_modes import held_at_orders, held_columns
+from snrmjax.identify.calibrate.prescribed_modes import (
+    prescribed_at_orders,
+    prescribed_mode_columns,
+)
 from snrmjax.identify.calibrate.state_fit import (
     FitAim,
     FitSettings,
@@ -51,29 +54,28 @@ def calibrate_model(
     """Fit parameters of a model to measured steady states of all levels at once.
 
     Minimises the whitened sum of squares of (F_model − F)/F over the states, F_model being the
-    complex force with which the model has the measured frequency and fundamental velocity
+    complex force that the model needs for the measured frequency and fundamental velocity
     (`inverse_force`), and of the differences at other sensors and of harmonics with a stated
     error. The covariance of a state's residuals follows from the stated errors of force, velocity
-    and phase; it is taken anew where a fit ended. Levenberg–Marquardt, with the balance's exact
-    derivatives.
+    and phase and is updated after each fit. Levenberg–Marquardt, with exact derivatives of the
+    harmonic balance.
 
-    Arguments: `model` gives the start and all that is not fitted; `parameters` are out of
-    `parameter_names`. `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ of errors
-    that all velocities of a level share: they become unknowns. With `priors` the standard
-    deviations that the model states for fitted parameters hold them near their start.
-    Returns a `CalibratedModel`: a fit that did not converge says so in its status and notes. A
-    state for which no balanced motion is found has no weight and is named there too. Where errors
-    of velocity are not stated for all states, equal relative ones are taken for all and their size
-    found from the residuals.
-    `held_modes` (counted from 0) are modes that may exchange energy: their motions at all recorded
-    orders are held as the sensors have them, of as many modes as there are sensors, and the forces
-    that are left on each are the residual. Inside an internal resonance no branch has then to be
-    chosen. Every state needs all sensors.
+    Arguments: `model` has the starting values and all that is not fitted; `parameters` are chosen
+    from `parameter_names`. `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ of errors
+    common to all velocities of a level, which become unknowns. With `priors` the model's stated
+    standard deviations of fitted parameters act as Gaussian priors. `held_modes` (counted from 0)
+    are modes that may exchange energy: their motions at all recorded orders are prescribed as
+    measured, for as many modes as there are sensors, and the force residuals of these modes are
+    minimised. Inside an internal resonance no branch has to be chosen. Every state needs all
+    sensors.
+    Returns a `CalibratedModel`; its status and notes report a fit that did not converge and states
+    without a solution of the harmonic balance, which have no weight. Where errors of velocity are
+    not stated for all states, equal relative errors are assumed and scaled by the residuals.
     Raises `ValueError` for unknown or repeated names, for sensors other than the model's, for an
     unknown force or phase, for levels' errors below zero and for too few data.
     Validity: motions with the period of the force. Errors of velocity enter to first order. Inside
-    an internal resonance several motions have one fundamental; without `held_modes` the one that
-    grows from small amplitudes is taken.
+    an internal resonance several motions share one fundamental; without `held_modes` the one that
+    continues from small amplitudes is taken.
     Not differentiable: differentiate `inverse_force`.
     Reference: the formulation is this package's own.
     """
@@ -84,16 +86,16 @@ def calibrate_model(
             raise ValueError(f"`level_{name}_std` must be zero or positive, but is {value}.")
     check_phases(data, "a calibration")
     chosen = calibration_states(model, data, harmonic_order)
-    held: tuple[tuple[int, ...], ...] = ()
+    prescribed: tuple[tuple[int, ...], ...] = ()
     if held_modes:
-        _check_held(model, tuple(held_modes))
-        chosen = held_columns(chosen)
+        _check_prescribed(model, tuple(held_modes))
+        chosen = prescribed_mode_columns(chosen)
         typical = float(np.median(np.asarray(chosen.states.frequency)))
         orders = (1, *chosen.orders)
-        held = held_at_orders(model, held_modes, typical, orders, len(chosen.sensors))
+        prescribed = prescribed_at_orders(model, held_modes, typical, orders, len(chosen.sensors))
     shared = tuple(name for name, value in level_std.items() if value > 0)
     picked = (chosen.sensors, chosen.orders, harmonic_order, shared, chosen.n_levels)
-    settings = FitSettings(names, *picked, held)
+    settings = FitSettings(names, *picked, prescribed)
     prior_std = np.array([stated_std(model, name) if priors else 0.0 for name in names])
     weight = np.divide(1.0, prior_std, out=np.zeros(len(names)), where=prior_std > 0)
     n_rows = int(chosen.states.known.sum()) + int(np.sum(weight > 0))
@@ -110,7 +112,7 @@ def calibrate_model(
     return _result(model, data.n_states, chosen, settings, aim)
 
 
-def _check_held(model: Structure, modes: tuple[int, ...]) -> None:
+def _check_prescribed(model: Structure, modes: tuple[int, ...]) -> None:
     if len(set(modes)) < len(modes) or not set(modes) <= set(range(model.n_modes)):
         raise ValueError(
             f"`held_modes` must be different modes from 0 to {model.n_modes - 1}, but is {modes}."
@@ -125,7 +127,7 @@ def _result(
     known = np.asarray(chosen.states.known) & usable[:, None]
     freedom = int(known.sum()) + int(np.sum(np.asarray(aim.weight) > 0)) - p
     square = np.sum(fit.residuals**2) + np.sum(
-        np.asarray(aim.misses(jnp.asarray(fit.unknowns))) ** 2
+        np.asarray(aim.prior_residuals(jnp.asarray(fit.unknowns))) ** 2
     )
     reduced = float(square) / freedom if freedom > 0 else np.nan
     values = np.asarray(aim.parameters(jnp.asarray(fit.unknowns)))
@@ -176,14 +178,14 @@ def _notes(
     if chosen.noise_stated and not abs(reduced - 1) <= margin:
         notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
     slopes = zip(names, fit.jacobian.T, strict=False)
-    blind = tuple(name for name, slope in slopes if not slope.any())
-    if blind:
-        notes.append(Fact("parameters_without_data", names=blind))
+    without_data = tuple(name for name, slope in slopes if not slope.any())
+    if without_data:
+        notes.append(Fact("parameters_without_data", names=without_data))
     return notes
 
 
 def _inverse_of_square(jacobian: np.ndarray) -> np.ndarray:
-    """(JᵀJ)⁻¹; infinite for what has no influence."""
+    """(JᵀJ)⁻¹; infinite for unknowns without influence."""
     seen = np.any(jacobian != 0, axis=0)
     inverse = np.diag(np.where(seen, 0.0, np.inf))
     inverse[np.ix_(seen, seen)] = inverse_of(jacobian[:, seen])

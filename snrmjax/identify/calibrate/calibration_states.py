@@ -1,4 +1,4 @@
-"""Measured states as a calibration compares them with a model."""
+"""Measured steady states in the form in which a calibration compares them with a model."""
 
 from typing import Any, NamedTuple, TypeVar
 
@@ -17,7 +17,7 @@ from snrmjax.numerics.facts import Fact
 OneKind = TypeVar("OneKind", Array, np.ndarray)
 
 ASSUMED_ERROR = 0.01
-"""Relative and rad, of velocities where no noise is stated: a fit then finds its size."""
+"""Relative and rad, of velocities where no noise is stated; the fit then estimates the scale."""
 
 
 class CalibrationStates(NamedTuple):
@@ -34,15 +34,15 @@ class CalibrationStates(NamedTuple):
     velocity: Complex[Array, "state sensor"]  # m/s
     harmonics: Complex[Array, "state sensor harmonic"]  # m/s
     error: Float[Array, "state input"]  # 1σ of log force, of log velocities and of phases
-    own_std: Float[Array, "state column"]  # 1σ of what a column alone has: noise of harmonics
-    known: Bool[Array, "state column"]  # what was measured
+    own_std: Float[Array, "state column"]  # 1σ of errors independent between columns: harmonics
+    known: Bool[Array, "state column"]  # whether measured
 
 
 class ComparedColumns(NamedTuple):
-    """The steady states of a measurement that a model is compared with, and their columns."""
+    """The steady states compared with a model, and the sensors and harmonics of their columns."""
 
     states: CalibrationStates
-    rows: Int[np.ndarray, " state"]  # of the data
+    rows: Int[np.ndarray, " state"]  # in the data
     n_levels: int
     sensors: tuple[int, ...]  # in the order of the states' sensors
     orders: tuple[int, ...]  # harmonics that are compared
@@ -57,9 +57,9 @@ def calibration_states(
     """The steady states that the reference sensor measured under a known force.
 
     Where the velocity of some state has no stated error, all get `ASSUMED_ERROR`. Harmonics are
-    compared where their error is stated. A velocity of unknown phase, and its harmonics, are real
-    and positive, and the imaginary part of what they are compared by is not known; where it is
-    that of the reference sensor, the phases of the whole state count as unknown.
+    compared where their error is stated. A velocity of unknown phase and its harmonics are stored
+    as real and positive, with the imaginary columns marked as unknown; if the reference sensor has
+    no phase, all phases of the state count as unknown.
     Raises `ValueError` for sensors other than the model's, where no force is known and where no
     state is left.
     """
@@ -70,13 +70,13 @@ def calibration_states(
         )
     check_force(data, "a comparison with a model")
     notes = []
-    # Operations of JAX compile for every number of states.
+    # NumPy: JAX operations would compile anew for every number of states.
     host: Any = jax.tree.map(np.asarray, data)
     r = reference_sensor(model.modes)
     sensors = [r, *(s for s in range(len(host.sensors)) if s != r)]
     velocity = host.velocity[:, sensors]
-    size = np.abs(velocity)
-    measured = host.measured[:, sensors] & np.isfinite(size) & (size > 0)
+    amplitude = np.abs(velocity)
+    measured = host.measured[:, sensors] & np.isfinite(amplitude) & (amplitude > 0)
     force, frequency = host.force, host.frequency
     rows = np.flatnonzero(measured[:, 0] & np.isfinite(force) & (force > 0) & (frequency > 0))
     if not rows.size:
@@ -87,30 +87,30 @@ def calibration_states(
     velocity, measured = np.where(measured, velocity, 0.0)[rows], measured[rows]
     host = taken(host, rows)
     errors = np.asarray(relative_errors(host))[:, sensors]
-    stated = bool(np.all(errors[measured][:, 1:] > 0))  # NaN is not
+    stated = bool(np.all(errors[measured][:, 1:] > 0))  # False for NaN
     if not stated:
         in_part = bool(np.any(errors[measured][:, 1:] > 0))
         errors = np.broadcast_to([0.0, ASSUMED_ERROR, ASSUMED_ERROR], errors.shape)
         notes.append(Fact("equal_errors_assumed", some_stated=in_part))
     errors = np.where(measured[..., None], errors, 0.0)
-    places = [k for k, h in enumerate(host.harmonic_order) if 1 < h <= harmonic_order]
-    harmonics = host.harmonics[:, sensors][..., places]
+    positions = [k for k, h in enumerate(host.harmonic_order) if 1 < h <= harmonic_order]
+    harmonics = host.harmonics[:, sensors][..., positions]
     std = host.harmonic_std[:, sensors] / np.abs(velocity[:, :1])
-    there = np.isfinite(np.abs(harmonics)) & (measured & (std > 0))[..., None]
+    recorded = np.isfinite(np.abs(harmonics)) & (measured & (std > 0))[..., None]
     unknown = np.asarray(host.phase_unknown)[:, sensors]
     unknown = measured & (unknown | unknown[:, :1])
     velocity = np.where(unknown, np.abs(velocity), velocity)
     harmonics = np.where(unknown[..., None], np.abs(harmonics), harmonics)
     errors[..., 2] = np.where(unknown, 0.0, errors[..., 2])
-    if places and not there.any():
+    if positions and not recorded.any():
         notes.append(Fact("harmonics_without_error"))
-        harmonics, there, places = harmonics[..., :0], there[..., :0], []
+        harmonics, recorded, positions = harmonics[..., :0], recorded[..., :0], []
     n = len(rows)
-    real = np.concatenate([np.ones((n, 1), bool), measured[:, 1:], there.reshape(n, -1)], axis=1)
-    alone = [unknown, np.repeat(unknown, len(places), axis=1)]
-    known = np.stack([real, real & ~np.concatenate(alone, axis=1)], axis=2).reshape(n, -1)
-    # Each part of a complex error has half its square.
-    own_std = np.where(there, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
+    real = np.concatenate([np.ones((n, 1), bool), measured[:, 1:], recorded.reshape(n, -1)], axis=1)
+    independent = [unknown, np.repeat(unknown, len(positions), axis=1)]
+    known = np.stack([real, real & ~np.concatenate(independent, axis=1)], axis=2).reshape(n, -1)
+    # `harmonic_std` is the rms of a complex error: each part has half the variance.
+    own_std = np.where(recorded, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
     order = host.order
     levels, level = np.unique(host.level, return_inverse=True)
     columns: list[Any] = [
@@ -119,15 +119,15 @@ def calibration_states(
         host.force,
         np.where(np.isfinite(order), order, np.asarray(model.test_order)),
         velocity,
-        np.where(there, harmonics, 0.0),
+        np.where(recorded, harmonics, 0.0),
         np.concatenate([errors[:, 0, :1], *np.moveaxis(errors, 2, 0)[1:]], 1),
         np.repeat(np.pad(own_std, ((0, 0), (len(sensors), 0))), 2, axis=1),
         known,
     ]
     parts = jax.device_put(CalibrationStates(*columns), may_alias=False)
-    orders = tuple(host.harmonic_order[k] for k in places)
-    own_places = (tuple(sensors), orders, unknown)
-    return ComparedColumns(parts, rows, len(levels), *own_places, stated, tuple(notes))
+    orders = tuple(host.harmonic_order[k] for k in positions)
+    compared = (tuple(sensors), orders, unknown)
+    return ComparedColumns(parts, rows, len(levels), *compared, stated, tuple(notes))
 
 
 @compiled
@@ -136,20 +136,20 @@ def state_whitener(
     by_error: Float[Array, "state column input"],
     harmonic_error: Float[Array, ""],
 ) -> Float[Array, "state column column"]:
-    """The matrices that make a state's columns independent and of unit variance.
+    """Whitening matrices: a state's columns become independent and of unit variance.
 
     Arguments: derivatives of the columns with respect to the errors in `states.error`;
-    `harmonic_error` is a further error of the harmonics, relative to their own size. Zero for
-    states whose derivatives are not finite: they have no weight.
+    `harmonic_error` is an additional relative error of the harmonics. Zero for states
+    whose derivatives are not finite: they have no weight.
     """
     good = jnp.all(jnp.isfinite(by_error), axis=(1, 2))[:, None, None]
     scaled = jnp.where(good, by_error, 1.0) * states.error[:, None, :]
-    size = jnp.abs(states.harmonics).reshape(len(by_error), -1) / jnp.abs(states.velocity[:, :1])
-    wide = jnp.pad(size, ((0, 0), (states.velocity.shape[1], 0)))
-    alone = states.own_std**2 + harmonic_error**2 * jnp.repeat(wide, 2, axis=1) ** 2
-    alone = jnp.where(states.known, alone, 1.0)
-    covariance = scaled @ scaled.transpose(0, 2, 1) + jax.vmap(jnp.diag)(alone)
-    # Rounding must not make it singular.
+    ratio = jnp.abs(states.harmonics).reshape(len(by_error), -1) / jnp.abs(states.velocity[:, :1])
+    wide = jnp.pad(ratio, ((0, 0), (states.velocity.shape[1], 0)))
+    independent = states.own_std**2 + harmonic_error**2 * jnp.repeat(wide, 2, axis=1) ** 2
+    independent = jnp.where(states.known, independent, 1.0)
+    covariance = scaled @ scaled.transpose(0, 2, 1) + jax.vmap(jnp.diag)(independent)
+    # Keeps the Cholesky factorisation from failing by rounding.
     floor = 1e-14 * jnp.trace(covariance, axis1=1, axis2=2)[:, None, None]
     eye = jnp.eye(covariance.shape[1])
     root = jnp.linalg.cholesky(covariance + floor * eye)
@@ -160,9 +160,9 @@ def state_whitener(
 def whitened_columns(
     whitener: Float[OneKind, "state column column"], columns: Float[OneKind, "state column *entry"]
 ) -> Float[OneKind, "state column *entry"]:
-    """Columns of all states, or their derivatives, made independent; zero without weight.
+    """Columns of all states, or their derivatives, whitened; zero for states without weight.
 
-    NumPy's arrays stay so.
+    NumPy arrays in, NumPy arrays out.
     """
     xp: Any = columns.__array_namespace__()
     used = xp.any(whitener != 0, axis=(1, 2)).reshape(-1, *(1,) * (columns.ndim - 1))

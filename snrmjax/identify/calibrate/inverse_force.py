@@ -18,13 +18,13 @@ from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion, prescri
 
 
 class InverseForce(AbstractResult):
-    """Motions with a prescribed fundamental and their forces; NaN where none was found."""
+    """Motions with a prescribed fundamental and their forces; NaN where the solution failed."""
 
     coordinates: ClassVar[tuple[str, ...]] = ("state", "harmonic")
 
     force: Complex[Array, " state"]  # N, as recorded, relative to the phase of the measured force
     velocity: Complex[Array, "state harmonic sensor"]  # m/s, as recorded, h = 0…H
-    converged: Bool[Array, " state"] = quantity("state", "1", "whether a motion was found")
+    converged: Bool[Array, " state"] = quantity("state", "1", "whether the motion converged")
 
     def variables(self) -> dict[str, Variable]:
         """Real and imaginary parts of forces and velocities."""
@@ -43,18 +43,18 @@ class InverseForce(AbstractResult):
 
 
 def inverse_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 9) -> InverseForce:
-    """The complex force with which a model has the measured frequencies and fundamentals.
+    """The complex force that a model needs for the measured frequencies and fundamentals.
 
     Solves the harmonic balance for all coefficients and the force, with the velocity's fundamental
     at the reference sensor prescribed as measured: single-valued through folds. The motion is
-    grown from small amplitudes by Newton's method.
+    continued from small amplitudes by Newton's method.
 
-    Arguments: `model`; `data` with forces in N, whose phases the answer is relative to.
-    Returns an `InverseForce`, NaN where no motion was found and for states that the reference
-    sensor did not measure. It is the measured force where model and measurement are right.
-    Differentiable once by the model's parameters, in forward and in reverse mode, by the implicit
-    function theorem; states without a motion have derivatives zero or NaN and leave the others' as
-    they are. By the data it is not: they are prepared on the host.
+    Arguments: `model`; `data` with forces in N, the phase reference of the result.
+    Returns an `InverseForce`, NaN where no solution was found and for states without a measurement
+    of the reference sensor. It equals the measured force where model and measurement are right.
+    Differentiable once with respect to the model's parameters, in forward and reverse mode, by the
+    implicit function theorem; states without a solution have derivatives zero or NaN and do not
+    affect the others. Not differentiable with respect to the data, which are prepared on the host.
     Raises `ValueError` for sensors other than the model's and for an unknown force or phase.
 
     >>> import snrmjax as sj
@@ -82,7 +82,7 @@ def state_motion(
     sensor: int,
     harmonic_order: int,
 ) -> PrescribedMotion:
-    """The equations of one state with a velocity (m/s) of the reference sensor."""
+    """The equations of one state with a prescribed velocity (m/s) of the reference sensor."""
     return prescribed_motion(
         eqx.tree_at(lambda m: m.test_order, model, state.order),
         *(state.frequency, state.force, velocity),
@@ -100,19 +100,19 @@ class StateWithErrors(NamedTuple):
     error: Float[Array, " input"]  # of the logarithms of force and velocities, and of the phases
 
     def velocity(self) -> Complex[Array, " sensor"]:
-        """Fundamentals freed of the errors, in m/s."""
+        """Fundamentals corrected for the errors, in m/s."""
         n = self.state.velocity.shape[0]
         factors = jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 : 2 * n + 1])
         return self.state.velocity * self.factor * factors
 
     def harmonics(self, orders: tuple[int, ...]) -> Complex[Array, "sensor harmonic"]:
-        """Harmonics freed of the errors, in m/s: a phase is an error of time, h times as large."""
+        """Harmonics corrected for the errors, in m/s; phase errors grow with the order h."""
         n = self.state.velocity.shape[0]
         phase = self.error[n + 1 : 2 * n + 1]
         factor = self.factor * jnp.exp(self.error[1 : n + 1] + 1j * phase)
-        size = jnp.abs(factor)
-        turn = (factor / size)[:, None] ** np.array(orders, dtype=int)
-        return self.state.harmonics * size[:, None] * turn
+        gain = jnp.abs(factor)
+        phase_factor = (factor / gain)[:, None] ** np.array(orders, dtype=int)
+        return self.state.harmonics * gain[:, None] * phase_factor
 
     def motion(self, model: Structure, sensor: int, harmonic_order: int) -> PrescribedMotion:
         """The equations of its motion."""
@@ -126,7 +126,7 @@ def residual_columns(
     sensors: tuple[int, ...],
     orders: tuple[int, ...],
 ) -> Float[Array, " column"]:
-    """Differences of a state's motion from the measured force, other sensors and harmonics.
+    """Deviations of a state's motion from the measured force, other sensors and harmonics.
 
     Arguments: `motion` is that of `erring`, and `point` its solution; `sensors` has the reference
     first; `orders` are the harmonics that are compared.
@@ -138,9 +138,9 @@ def residual_columns(
     force, seen = motion.recorded(point)
     seen = seen[:, np.array(sensors)]
     higher = seen[np.array(orders, dtype=int)].T - harmonics
-    missed = jnp.append((seen[1] - velocity)[1:], higher.reshape(-1)) / jnp.abs(state.velocity[0])
+    misfit = jnp.append((seen[1] - velocity)[1:], higher.reshape(-1)) / jnp.abs(state.velocity[0])
     force_misfit = (force - state.force * jnp.exp(erring.error[0])) / state.force
-    each = jnp.append(force_misfit, missed)
+    each = jnp.append(force_misfit, misfit)
     parts = jnp.stack([each.real, each.imag], axis=1).reshape(-1)
     return jnp.where(state.known, parts, 0.0)
 
@@ -150,9 +150,9 @@ def _needed(
     model: Structure, states: CalibrationStates, sensor: int, harmonic_order: int
 ) -> InverseForce:
     def one(state: CalibrationStates) -> InverseForce:
-        held = state_motion(model, state, state.velocity[0], sensor, harmonic_order)
-        point = held.solved(held.grown())
-        force, velocity = held.recorded(point)
+        motion = state_motion(model, state, state.velocity[0], sensor, harmonic_order)
+        point = motion.solved(motion.grown())
+        force, velocity = motion.recorded(point)
         return InverseForce(force, velocity, jnp.isfinite(jax.lax.stop_gradient(point[-1])))
 
     return mapped(one, states)

@@ -1,4 +1,4 @@
-"""A model fitted to states by inverse harmonic balance: rounds of whitening and of steps."""
+"""A model fitted to states by inverse harmonic balance: rounds of whitening and fitting."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,8 +14,13 @@ from snrmjax.identify.calibrate.calibration_states import (
     state_whitener,
     whitened_columns,
 )
-from snrmjax.identify.calibrate.held_modes import HeldModes, HeldState, columns_of_held, held_motion
 from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_columns
+from snrmjax.identify.calibrate.prescribed_modes import (
+    PrescribedModes,
+    PrescribedModesState,
+    columns_of_prescribed,
+    prescribed_mode_motion,
+)
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
@@ -25,9 +30,9 @@ from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion
 
 
 class _Round(NamedTuple):
-    """One round of fitting and whitening anew.
+    """One round of fitting, before the residuals are whitened anew.
 
-    In the first rounds, far from the truth, what the data say little about stays within a relative
+    In the first rounds, far from the solution, poorly determined parameters stay within a relative
     step of about `step`, and harmonics, which mislead there, have a relative error of
     `harmonic_error`. A round ends with a step that lowers χ² by less than `settled`.
     """
@@ -43,40 +48,40 @@ _ROUNDS = (
     _Round(np.inf, 0.0, 1e-3),
     _Round(np.inf, 0.0, 1e-12),
 )
-_CORRECTIONS = 8  # of the records for their errors, at most
-_UNMOVED = 1e-4  # of χ², which a further correction changes less
+_CORRECTIONS = 8  # largest number of corrections of the records for their errors
+_UNMOVED = 1e-4  # relative change of χ² below which corrections stop
 _RULE = StepRule(steps=60)
 
 
 class FitSettings(NamedTuple):
-    """What is compiled into a program."""
+    """Static settings of the compiled functions."""
 
     names: tuple[str, ...]
     sensors: tuple[int, ...]  # rows of the mode shapes, the reference sensor first
     orders: tuple[int, ...]  # harmonics that are compared
     harmonic_order: int
-    shared: tuple[str, ...]  # errors that a level shares
+    shared: tuple[str, ...]  # errors common to all velocities of a level
     n_levels: int
-    held_modes: tuple[tuple[int, ...], ...] = ()  # whose motion is held as measured, an order each
+    prescribed_modes: tuple[tuple[int, ...], ...] = ()  # with motions as measured, for each order
 
     def motion(
         self, model: Structure, erring: StateWithErrors
-    ) -> tuple[PrescribedMotion | HeldState, Callable[[Array], Array]]:
-        """The equations of a state, and its columns of a solution."""
-        if not self.held_modes:
+    ) -> tuple[PrescribedMotion | PrescribedModesState, Callable[[Array], Array]]:
+        """The equations of a state, and the function from a solution to its columns."""
+        if not self.prescribed_modes:
             given = erring.motion(model, self.sensors[0], self.harmonic_order)
-            seen = self.sensors, self.orders
-            return given, lambda point: residual_columns(erring, given, point, *seen)
-        held = HeldModes(self.held_modes, self.sensors, (1, *self.orders))
-        motion = held_motion(erring, model, held, self.harmonic_order)
-        return motion, lambda point: columns_of_held(motion, erring.state, point)
+            compared = self.sensors, self.orders
+            return given, lambda point: residual_columns(erring, given, point, *compared)
+        prescribed = PrescribedModes(self.prescribed_modes, self.sensors, (1, *self.orders))
+        motion = prescribed_mode_motion(erring, model, prescribed, self.harmonic_order)
+        return motion, lambda point: columns_of_prescribed(motion, erring.state, point)
 
 
 class FitAim(NamedTuple):
-    """What unknowns mean, and what holds them near zero, where they all begin.
+    """Scaling and priors of the unknowns, which all start at zero.
 
-    An unknown is a parameter's change relative to its start, or its value where that is zero, or
-    what a level shares in units of 1σ.
+    An unknown is a parameter's change relative to its start (its value where the start is zero) or
+    an error common to a level in units of 1σ.
     """
 
     values: Float[Array, " parameter"]
@@ -88,14 +93,14 @@ class FitAim(NamedTuple):
         changes = unknowns[: self.values.shape[0]]
         return jnp.where(self.values != 0, self.values * (1 + changes), changes)
 
-    def misses(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
-        """Residuals of the unknowns themselves."""
+    def prior_residuals(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """Residuals of the priors."""
         off = (self.parameters(unknowns) - self.values) * self.weight
         return jnp.append(off, unknowns[off.shape[0] :])
 
 
 class _Slopes(NamedTuple):
-    """All states at some unknowns, and their derivatives."""
+    """Solutions and columns of all states at given unknowns, and their derivatives."""
 
     points: Float[Array, "state entry"]
     columns: Float[Array, "state column"]
@@ -111,7 +116,7 @@ def _grown(
     settings: FitSettings,
     parameters: Float[Array, " parameter"],
 ) -> Float[Array, "state entry"]:
-    """Solutions for the measured velocities, grown from small amplitudes."""
+    """Solutions for the measured velocities, continued from small amplitudes."""
     model = with_parameters(model, settings.names, parameters)
 
     def one(state: CalibrationStates) -> Array:
@@ -130,9 +135,9 @@ def _columns(
     error: Float[Array, " input"],
     near: Float[Array, " entry"],
 ) -> tuple[Float[Array, " column"], Float[Array, " entry"]]:
-    """Columns of one state, and the solution behind them.
+    """Columns of one state, and its solution.
 
-    `error` adds to the logarithms of force and velocities and to the phases: for derivatives.
+    `error` adds to the logarithms of force and velocities and to the phases, for derivatives.
     """
     p = len(settings.names)
     model = with_parameters(model, settings.names, aim.parameters(unknowns))
@@ -168,19 +173,19 @@ def _slopes(
 
 
 class _Frame(NamedTuple):
-    """Errors that the records are corrected for, what these add, and the whitening."""
+    """Errors that the records are corrected for, their effect on the columns, and the whitening."""
 
     errors: Float[np.ndarray, "state input"]
     offset: Float[np.ndarray, "state column"]
     whiten: Float[np.ndarray, "state column column"]
 
     def whitened(self, columns: Float[np.ndarray, "state column"]) -> Float[np.ndarray, " row"]:
-        """Columns without what the errors add, independent and of unit variance."""
+        """Columns without the effect of the errors, independent and of unit variance."""
         return whitened_columns(self.whiten, columns - self.offset)
 
 
 class _Linear(NamedTuple):
-    """The whitened problem at some unknowns."""
+    """The whitened problem, linearised at given unknowns."""
 
     residuals: Float[np.ndarray, " row"]
     jacobian: Float[np.ndarray, "row unknown"]
@@ -189,7 +194,7 @@ class _Linear(NamedTuple):
 
 
 class FittedStates(NamedTuple):
-    """Where a fit ended: unknowns, whitened residuals and their derivatives."""
+    """End of a fit: unknowns, whitened residuals and their derivatives."""
 
     unknowns: np.ndarray
     residuals: Float[np.ndarray, "state column"]
@@ -199,7 +204,7 @@ class FittedStates(NamedTuple):
 
 
 class FittedSubject(NamedTuple):
-    """A model with the states that it is fitted to."""
+    """A model and the states that it is fitted to."""
 
     model: Structure
     states: CalibrationStates
@@ -215,7 +220,7 @@ class FittedSubject(NamedTuple):
         return _slopes(*self, jnp.asarray(unknowns), near, jnp.asarray(errors))
 
     def framed(self, slopes: _Slopes, errors: np.ndarray, harmonic_error: float = 0.0) -> _Frame:
-        """The whitening by what the records' errors do to the columns."""
+        """The whitening from the sensitivities of the columns to errors of the records."""
         by_error = slopes.by_error
         whiten = np.asarray(state_whitener(self.states, by_error, jnp.asarray(harmonic_error)))
         offset = np.einsum("sci,si->sc", np.nan_to_num(np.asarray(by_error)), errors)
@@ -224,11 +229,11 @@ class FittedSubject(NamedTuple):
     def corrected(
         self, unknowns: np.ndarray, slopes: _Slopes, frame: _Frame
     ) -> tuple[_Slopes, _Frame]:
-        """The records corrected for the errors that a model with these unknowns finds in them.
+        """The records corrected for their most probable errors under these unknowns.
 
-        Of all errors that leave no residual those of the least sum of squares. A force that
-        multiplies a motion of little more than noise would else be found too small: the error
-        stands in both.
+        Among all errors that leave no residual, those with the least weighted sum of squares
+        (errors in variables). Otherwise a coefficient that multiplies a motion near the noise level
+        is biased low.
         Reference: Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput. 8 (1987) 1052,
         doi:10.1137/0908085.
         """
@@ -238,31 +243,31 @@ class FittedSubject(NamedTuple):
             square = float(np.sum(left**2))
             if not abs(before - square) > _UNMOVED * square:
                 break
-            pulled = whitened_columns(frame.whiten, np.asarray(slopes.by_error))
-            errors = -np.einsum("sci,sc->si", pulled, left) * variance
+            sensitivity = whitened_columns(frame.whiten, np.asarray(slopes.by_error))
+            errors = -np.einsum("sci,sc->si", sensitivity, left) * variance
             slopes, before = self.slopes(unknowns, slopes.points, errors), square
             frame = self.framed(slopes, errors)
         return slopes, frame
 
 
 def fitted_states(subject: FittedSubject) -> FittedStates:
-    """Fit, whiten anew where the fit ended, and fit again; held motions are corrected then."""
+    """Alternate fits and whitening; prescribed motions get a last round with corrected records."""
     settings, aim = subject.settings, subject.aim
     unknowns = np.zeros(len(settings.names) + settings.n_levels * len(settings.shared))
     status, relative = MinimisationStatus.NOT_FITTED, np.asarray(aim.values) != 0
     exact = np.zeros(subject.states.error.shape)
     slopes = subject.slopes(unknowns, subject.grown(unknowns), exact)
     frame = subject.framed(slopes, exact)
-    rounds = (*_ROUNDS, *(_ROUNDS[-1:] if settings.held_modes else ()))
-    for turn, (step, harmonic_error, settled) in enumerate(rounds):
+    rounds = (*_ROUNDS, *(_ROUNDS[-1:] if settings.prescribed_modes else ()))
+    for number, (step, harmonic_error, settled) in enumerate(rounds):
         lost = ~np.isfinite(np.asarray(slopes.points[:, -1]))
-        if turn and lost.any():
+        if number and lost.any():
             again = jnp.where(lost[:, None], subject.grown(unknowns), slopes.points)
             slopes = subject.slopes(unknowns, again, exact)
         frame = subject.framed(slopes, exact, harmonic_error)
-        hold = np.append(relative / step, np.zeros(len(unknowns) - len(relative)))
-        correct = turn >= len(_ROUNDS)
-        end = _settled(subject, unknowns, slopes, frame, hold, settled, correct=correct)
+        penalty = np.append(relative / step, np.zeros(len(unknowns) - len(relative)))
+        correct = number >= len(_ROUNDS)
+        end = _settled(subject, unknowns, slopes, frame, penalty, settled, correct=correct)
         unknowns, status = end.point, end.status
         _, _, slopes, frame = end.linearised
     if not np.any(frame.whiten):
@@ -281,14 +286,14 @@ def _settled(
     begin: Float[np.ndarray, " unknown"],
     slopes: _Slopes,
     frame: _Frame,
-    hold: Float[np.ndarray, " unknown"],
+    penalty: Float[np.ndarray, " unknown"],
     settled: float,
     *,
     correct: bool,
 ) -> Minimum[_Linear]:
-    """The best unknowns, held near where they begin; with states whitened like this, or corrected.
+    """One minimisation; `penalty` weights the distance from `begin`.
 
-    Arguments: `correct` finds the records' errors anew for all unknowns.
+    Arguments: `correct` re-estimates the records' errors at every trial.
     """
     aim = subject.aim
 
@@ -297,13 +302,13 @@ def _settled(
         if correct:
             at, own = subject.corrected(unknowns, at, subject.framed(at, frame.errors))
         columns = own.whitened(np.asarray(at.columns)).reshape(-1)
-        misses = np.asarray(aim.misses(jnp.asarray(unknowns)))
-        jacobian = np.concatenate([_jacobian(own.whiten, at, aim), np.diag(hold)])
-        residuals = np.concatenate([columns, misses, hold * (unknowns - begin)])
+        prior_residuals = np.asarray(aim.prior_residuals(jnp.asarray(unknowns)))
+        jacobian = np.concatenate([_jacobian(own.whiten, at, aim), np.diag(penalty)])
+        residuals = np.concatenate([columns, prior_residuals, penalty * (unknowns - begin)])
         return _Linear(residuals, jacobian, at, own)
 
     def evaluate(trials: np.ndarray) -> list[_Linear]:
-        # A state that is lost on the way is NaN: a smaller step is then taken.
+        # A state whose solution is lost becomes NaN, which makes the minimiser shorten its step.
         near = [slopes.points + slopes.points_by_unknown @ (trial - begin) for trial in trials]
         return [
             linear(trial, subject.slopes(trial, start, frame.errors))

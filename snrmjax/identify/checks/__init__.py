@@ -1,1 +1,1 @@
-"""Whether data determine what a fit was asked for, said in words or refused."""
+"""Whether the data determine what a fit estimates: notes and refusals."""

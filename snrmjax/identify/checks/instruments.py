@@ -1,4 +1,4 @@
-"""Whether data determine the errors of the instruments that a fit was asked to find."""
+"""Whether the data determine the instrument errors that a fit estimates."""
 
 from collections.abc import Sequence
 from enum import StrEnum
@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from snrmjax.numerics.facts import Fact
 
-_BESIDE_RESONANCE = np.radians(20)  # a state's phase, up to which inertia hardly counts
+_NEAR_RESONANCE = np.radians(20)  # phase from resonance, within which inertia hardly counts
 
-# 1σ from which on an unknown is doubted, and from which on there is no answer: of a gain's
+# 1σ above which an unknown is poorly determined, and above which the fit is refused: of a gain's
 # logarithm, of an offset over the smallest force, of a phase in rad.
 _BOUNDS = {
     "force_gain": (0.1, 0.5),
@@ -21,7 +21,7 @@ _BOUNDS = {
 
 
 class Determination(StrEnum):
-    """How well data determine an unknown of the instruments."""
+    """How well the data determine an instrument error."""
 
     WELL = "well"
     HARDLY = "hardly"
@@ -29,14 +29,14 @@ class Determination(StrEnum):
 
 
 def _determined(name: str, std: float) -> Determination:
-    doubted, refused = _BOUNDS[name]
-    if std < doubted:
+    uncertain, undetermined = _BOUNDS[name]
+    if std < uncertain:
         return Determination.WELL
-    return Determination.HARDLY if std < refused else Determination.NOT_AT_ALL
+    return Determination.HARDLY if std < undetermined else Determination.NOT_AT_ALL
 
 
 def force_gain_undetermined(std: float, farthest: float) -> Fact | None:
-    """That data do not determine a force gain; None where they do.
+    """Note that the data do not determine a force gain; None where they do.
 
     Arguments: `std` 1σ of the gain's logarithm; `farthest` the largest phase of a state from
     resonance, rad.
@@ -44,7 +44,7 @@ def force_gain_undetermined(std: float, farthest: float) -> Fact | None:
     how = _determined("force_gain", std)
     if how is not Determination.WELL:
         return Fact("force_gain_undetermined", std=std, how=how)
-    if farthest > _BESIDE_RESONANCE:
+    if farthest > _NEAR_RESONANCE:
         return None
     return Fact("force_gain_near_resonance", farthest_deg=float(np.degrees(farthest)))
 
@@ -52,40 +52,42 @@ def force_gain_undetermined(std: float, farthest: float) -> Fact | None:
 def require_passive(
     free: Sequence[str], mass: float, damping: Float[np.ndarray, " state"] | None = None
 ) -> None:
-    """Raise `ValueError` for a fit that no passive structure has.
+    """Raise `ValueError` for a fit that is not passive.
 
-    With a gain or a phase that nobody knows, force and damping below zero fit states of one side of
-    resonance as well: damping must then be positive at every state. Where the force is known it
-    may be negative over a part of the amplitudes, as of a self-excited structure.
+    With an unknown gain or phase, states on one side of resonance are fitted equally well by a
+    reversed force with negative damping: damping must then be positive at every state. With known
+    force it may be negative over a range of amplitudes, as in self-excited structures.
 
-    Arguments: `free` what of the instruments is unknown; `mass` the modal mass over the model's;
-    `damping` that of the states, 1/s, once it is known.
+    Arguments: `free` the unknown instrument errors; `mass` the modal mass over the model's;
+    `damping` of the states, 1/s, where already fitted.
     """
-    turned = tuple(name for name in free if name != "force_offset")
+    sign_unknown = tuple(name for name in free if name != "force_offset")
     if not mass > 0:
-        raise ValueError(str(Fact("fit_not_passive", what="modal mass", free=turned)))
-    some = damping is not None and not bool((np.all if turned else np.any)(damping > 0))
-    if some:
-        raise ValueError(str(Fact("fit_not_passive", what="damping", free=turned)))
+        raise ValueError(str(Fact("fit_not_passive", what="modal mass", free=sign_unknown)))
+    not_passive = damping is not None and not bool(
+        (np.all if sign_unknown else np.any)(damping > 0)
+    )
+    if not_passive:
+        raise ValueError(str(Fact("fit_not_passive", what="damping", free=sign_unknown)))
 
 
 def notes_on_instruments(fit: Any) -> list[Fact]:
-    """What data hardly determine of the unknowns that a joint fit freed.
+    """Notes on instrument errors of a joint fit that the data determine poorly.
 
-    Raises `ValueError` where one is not determined at all, so that the answer would mean nothing.
+    Raises `ValueError` where one is not determined at all: the fit would be meaningless.
     """
     names, notes = fit.names(), []
     std = np.sqrt(np.abs(np.diag(fit.covariance)))
     for name in fit.free:
-        size = float(std[names.index(name)])
-        how = _determined(name, size)
+        std_of_unknown = float(std[names.index(name)])
+        how = _determined(name, std_of_unknown)
         if name == "force_gain":
             phase = np.angle(np.asarray(fit.motion().velocity))
-            note = force_gain_undetermined(size, float(np.max(np.abs(phase))))
+            note = force_gain_undetermined(std_of_unknown, float(np.max(np.abs(phase))))
         elif how is Determination.WELL:
             note = None
         else:
-            note = Fact("instrument_undetermined", name=name, std=size, how=how)
+            note = Fact("instrument_undetermined", name=name, std=std_of_unknown, how=how)
         if how is Determination.NOT_AT_ALL:
             raise ValueError(str(note))
         notes += [] if note is None else [note]

@@ -1,38 +1,36 @@
-"""Autocorrelation of the residuals along a resonance, and what it adds to a band.
+"""Autocorrelation of the residuals along a resonance, and the loss of independent states.
 
-Independent noise averages out over many states, correlated residuals do not. They are left by a
-curve that the data do not follow, or by a motion that was not steady.
+Independent noise averages out over many states, correlated residuals do not. They indicate a curve
+that misses the data, or unsteady motion.
 """
 
 import numpy as np
 from jaxtyping import Float, Int
 
-_CORRELATION_STDS = (
-    4.0  # standard deviations of white noise's correlation, beyond which one is real
-)
-_FAR_BELOW_NOISE = 0.1  # of the noise: the correlation of smaller residuals does not count
-_LARGEST = 0.98  # correlation: an estimate may exceed what a band can be widened by
+_CORRELATION_STDS = 4.0  # significance threshold, in 1σ of white noise's correlation
+_FAR_BELOW_NOISE = 0.1  # of the noise: the correlation of smaller residuals is ignored
+_LARGEST = 0.98  # upper bound of the correlation: (1 + ρ)/(1 − ρ) must stay finite
 
 
 def states_of_levels(
     level: Int[np.ndarray, " state"], by: Float[np.ndarray, " state"]
-) -> list[Int[np.ndarray, " place"]]:
-    """The states of every level, in the order of their frequencies, or of what else is given."""
+) -> list[Int[np.ndarray, " index"]]:
+    """Indices of the states of every level, sorted by frequency or any other values `by`."""
     order = np.argsort(by, kind="stable")
     return [order[level[order] == number] for number in np.unique(level)]
 
 
 def residual_autocorrelation(
-    residuals: Float[np.ndarray, "state part"], levels: list[Int[np.ndarray, " place"]]
+    residuals: Float[np.ndarray, "state part"], levels: list[Int[np.ndarray, " index"]]
 ) -> Float[np.ndarray, " part"]:
     """Autocorrelation at lag one of the residuals along their level, of both parts.
 
-    Under noise of its own, slow misfits have a smaller correlation at lag one than at larger lags:
-    that of a first-order process with the same sum of correlations counts if it is larger.
-    Zero where white noise may well have it, or residuals are far below the noise.
+    Slow misfits under white noise have a small correlation at lag one but a long tail: the
+    correlation of a first-order process with the same sum of correlations is used if larger.
+    Zero where it is not significant, or where residuals are far below the noise.
     Arguments: whitened `residuals`; `levels` from `states_of_levels`.
-    Reference: for the sum up to the first negative one, Geyer, Stat. Sci. 7 (1992) 473,
-    doi:10.1214/ss/1177011137.
+    Reference: for truncating the sum at the first negative correlation, Geyer, Stat. Sci. 7 (1992)
+    473, doi:10.1214/ss/1177011137.
     """
     correlations = []
     for part in residuals.T:
@@ -51,28 +49,28 @@ def residual_autocorrelation(
     return np.array(correlations)
 
 
-def fraction_told_by(
+def independent_fraction(
     residuals: Float[np.ndarray, "state part"],
     level: Int[np.ndarray, " state"],
     frequency: Float[np.ndarray, " state"],
 ) -> float:
-    """Share of the states that tell something of their own, by what a fit leaves of them.
+    """Effective fraction of independent states, from the residuals of a fit.
 
-    n values of a first-order process with correlation ρ tell its mean as well as n(1 − ρ)/(1 + ρ)
-    independent ones; the mean of both parts counts, whatever the size of the residuals is.
+    n values of a first-order process with correlation ρ determine its mean as well as
+    n(1 − ρ)/(1 + ρ) independent ones; mean over both parts, each scaled to unit variance.
     """
-    size = np.sqrt(np.mean(residuals**2, axis=0))
+    rms = np.sqrt(np.mean(residuals**2, axis=0))
     levels = states_of_levels(level, frequency)
-    correlation = residual_autocorrelation(residuals / size, levels)
+    correlation = residual_autocorrelation(residuals / rms, levels)
     return float(np.mean((1 - correlation) / (1 + correlation)))
 
 
 def _correlation(
-    residuals: Float[np.ndarray, " state"], levels: list[Int[np.ndarray, " place"]], lag: int
+    residuals: Float[np.ndarray, " state"], levels: list[Int[np.ndarray, " index"]], lag: int
 ) -> tuple[float, int]:
-    """Correlation of residuals so many states apart, and the pairs that tell it.
+    """Correlation of residuals at a lag, and the number of pairs.
 
-    The sum is divided by all states, as is usual: few pairs far apart weigh little.
+    The sum is divided by that of all states, as usual (biased estimate): few pairs weigh little.
     """
     pairs = sum(max(len(some) - lag, 0) for some in levels)
     product = sum(float(residuals[a[:-lag]] @ residuals[a[lag:]]) for a in levels)

@@ -22,45 +22,45 @@ from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 RATIOS = (1, 2, 3)
 """Harmonics of the mode of interest at which another mode may be excited."""
 
-# Terms of both modes by how often the second stands in them: what resonates comes first.
+# Exponents (a, b) of q_j^a q_k^b by frequency ratio: the resonant terms, then the others.
 _RESONANT = {1: ((3, 1), (2, 2), (1, 3)), 2: ((2, 1),), 3: ((3, 1),)}
-_BESIDE = {1: ((0, 4),), 2: ((2, 2), (1, 2), (0, 4)), 3: ((2, 2), (0, 4))}
+_NONRESONANT = {1: ((0, 4),), 2: ((2, 2), (1, 2), (0, 4)), 3: ((2, 2), (0, 4))}
 _OWN = ((4, 0), (3, 0))
-_FURTHER = 0.2  # prior probability of a term that does not resonate
+_EXTRA_TERM = 0.2  # prior probability of a nonresonant term
 
 
 class CouplingTerm(NamedTuple):
     """A monomial q_j^a q_k^b of a potential."""
 
-    key: str  # as a model file has it
+    key: str  # as in a model file
     powers: tuple[int, int]  # a and b
-    couples: bool  # whether it carries energy between the modes at the ratio
+    couples: bool  # whether it is resonant: exchanges energy between the modes at the ratio
 
     @property
     def kept(self) -> bool:
-        """Whether it stays where modes are coupled: of terms that act alike none can be left out.
+        """Whether it is always in the model of coupled modes.
 
-        q_j²q_k² moves both frequencies at every ratio, and with them what a resonant term does.
+        q_j²q_k² detunes both modes at every ratio and so changes the action of a resonant term.
         """
         return self.couples or self.powers == (2, 2)
 
 
 def coupling_terms(mode: int, other: int, ratio: int) -> tuple[CouplingTerm, ...]:
-    """The terms of two modes at a ratio: those that resonate, others of both, the mode's own."""
+    """The terms of two modes at a ratio: the resonant ones, others of both, the mode's own."""
     resonant = _RESONANT[ratio]
     return tuple(
         CouplingTerm(
             monomial_key(tuple(sorted((mode,) * a + (other,) * b))), (a, b), (a, b) in resonant
         )
-        for a, b in (*resonant, *_BESIDE[ratio], *_OWN)
+        for a, b in (*resonant, *_NONRESONANT[ratio], *_OWN)
     )
 
 
 class ChosenTerms(NamedTuple):
-    """How probable choices of terms are."""
+    """Posterior over choices of terms."""
 
     best: Bool[np.ndarray, " term"]
-    coupled: float  # that one that resonates is there
+    coupled: float  # probability of at least one resonant term
 
 
 def chosen_terms(
@@ -69,27 +69,27 @@ def chosen_terms(
     information: Float[np.ndarray, "term term"],
     prior_std: Float[np.ndarray, " term"],
 ) -> ChosenTerms:
-    """Posterior probabilities over all choices of terms, by their evidence.
+    """Posterior probabilities of all choices of terms, from their evidence.
 
-    With χ² quadratic about `values`, of `information` H, and coefficients N(0, σ²) a choice A has
-    ln Z = ½ bᵀP⁻¹b − ½ ln det P − Σ ln σ, P = H_AA + diag(1/σ²), b = (H c)_A. Whether the modes
-    are coupled has probability ½ beforehand, each further term less.
+    With χ² quadratic about `values`, of `information` H, and coefficients N(0, σ²), a choice A has
+    ln Z = ½ bᵀP⁻¹b − ½ ln det P − Σ ln σ, P = H_AA + diag(1/σ²), b = (H c)_A. The prior
+    probability of coupling is ½; each nonresonant term has a smaller one.
     """
-    pull, resonant = information @ values, np.array([term.couples for term in terms])
+    gradient, resonant = information @ values, np.array([term.couples for term in terms])
     choices = np.array(list(itertools.product([False, True], repeat=len(terms))))
     evidence = np.zeros(len(choices))
     for row, choice in enumerate(choices):
         at = np.flatnonzero(choice)
         if not at.size:
             continue
-        size = prior_std[at]
-        # In units of the prior, where the matrix is near one.
-        matrix = information[np.ix_(at, at)] * np.outer(size, size) + np.eye(len(at))
-        b = pull[at] * size
+        std = prior_std[at]
+        # Scaled by the prior 1σ for conditioning.
+        matrix = information[np.ix_(at, at)] * np.outer(std, std) + np.eye(len(at))
+        b = gradient[at] * std
         evidence[row] = 0.5 * (b @ np.linalg.solve(matrix, b) - np.linalg.slogdet(matrix)[1])
     couples = choices[:, resonant].any(axis=1)
     further = choices[:, ~resonant].sum(axis=1)
-    prior = _FURTHER**further * (1 - _FURTHER) ** ((~resonant).sum() - further)
+    prior = _EXTRA_TERM**further * (1 - _EXTRA_TERM) ** ((~resonant).sum() - further)
     prior = prior * np.where(couples, 0.5 / (2 ** resonant.sum() - 1), 0.5)
     weight = prior * np.exp(evidence - evidence.max())
     weight /= weight.sum()
@@ -99,11 +99,13 @@ def chosen_terms(
     )
 
 
-_NEAR = 0.15  # relative detuning up to which a harmonic can excite a mode much
-_COUPLED = 0.5  # probability from which on modes are said to be coupled
-_EVEN = 2  # the harmonic that cubic terms of a potential make
-_SEEN = 5.0  # standard errors of another mode's motion, and
-_STRONG = 5e-3  # its share of the mode of interest's, from which on it is looked at unasked
+_NEAR = 0.15  # relative detuning up to which a harmonic can excite a mode strongly
+_COUPLED = 0.5  # probability above which modes are reported as coupled
+_EVEN = 2  # the harmonic that cubic terms of a potential generate
+_SEEN = 5.0  # standard errors of another mode's motion and
+_STRONG = (
+    5e-3  # its fraction of the mode of interest's, above which coupling is assessed by default
+)
 
 
 class Interaction(NamedTuple):
@@ -112,15 +114,15 @@ class Interaction(NamedTuple):
     mode: int  # counted from zero, as `other` is
     other: int
     ratio: int  # harmonic of the motion at which the other mode is excited
-    detuning: float  # of the other mode from that harmonic, relative, the smallest measured
-    fraction: float  # of the energy that the other mode has at that harmonic, the largest measured
-    probability: float  # that a term which couples them at this ratio is there
+    detuning: float  # of the other mode from that harmonic, relative, smallest over the states
+    fraction: float  # of the energy in the other mode at that harmonic, largest over the states
+    probability: float  # of a term that couples them at this ratio
 
 
 class CoupledModes(AbstractResult):
     """A model of modes that exchange energy, fitted to steady states; see `coupled_modes`.
 
-    `interactions` has all that were looked at, the most probable one first.
+    `interactions` lists all that were assessed, the most probable first.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("interaction",)
@@ -131,19 +133,19 @@ class CoupledModes(AbstractResult):
         "interaction", "1", "probability that the modes are coupled"
     )
     fraction: Float[np.ndarray, " interaction"] = quantity(
-        "interaction", "1", "largest share of the energy in the other mode"
+        "interaction", "1", "largest fraction of the energy in the other mode"
     )
     coupled: bool = setting()
     notes: tuple[Fact, ...] = setting()
 
     @property
     def model(self) -> Structure:
-        """The model with the terms that the data ask for."""
+        """The model with the terms that the data support."""
         return self.calibration.model
 
     @property
     def interaction(self) -> Interaction | None:
-        """The interaction that the data show; None for none."""
+        """The most probable interaction; None where the modes are not coupled."""
         return self.interactions[0] if self.coupled else None
 
     def summary(self) -> tuple[str, ...]:
@@ -154,16 +156,16 @@ class CoupledModes(AbstractResult):
             f"{i.other + 1}"
             for i in self.interactions
         ]
-        found = "coupled" if self.coupled else "not coupled"
+        verdict = "coupled" if self.coupled else "not coupled"
         return (
-            f"CoupledModes: {found}",
+            f"CoupledModes: {verdict}",
             *lines,
             *self.calibration.summary(),
             *(f"note: {note}" for note in self.notes),
         )
 
     def variables(self) -> dict[str, Variable]:
-        """Those of the fields, with what an interaction is."""
+        """Those of the fields, with modes and ratio of each interaction."""
         names = [f"{i.mode + 1}-{i.other + 1} 1:{i.ratio}" for i in self.interactions]
         where = Variable(("interaction",), np.array(names, dtype=str), "", "modes and ratio")
         return {"interaction": where, **super().variables()}
@@ -178,27 +180,27 @@ def coupled_modes(
     level_gain_std: float = 0.0,
     level_phase_std: float = 0.0,
 ) -> CoupledModes:
-    """Recognise which mode exchanges energy with the mode of interest, and fit how.
+    """Identify internal resonances of the mode of interest and fit the coupling terms.
 
-    Looked at are modes near the first, second or third harmonic of the measured frequencies (1:1,
-    1:2, 1:3). For each the potential gets all cubic and quartic terms of both modes that matter
-    at that ratio, and their coefficients are fitted with the motions of both modes held as
-    measured (`calibrate_model` with `held_modes`): no branch has to be chosen. Which terms are
-    there follows from their evidence; these are fitted once more.
+    Candidates are modes near the first, second or third harmonic of the measured frequencies (1:1,
+    1:2, 1:3). For each, the potential gets the cubic and quartic terms of both modes that matter at
+    that ratio, and their coefficients are fitted with the motions of both modes prescribed as
+    measured (`calibrate_model` with `held_modes`): no branch has to be chosen. Terms are selected
+    by their evidence and fitted once more.
 
-    Arguments: `data` of sensors that see both modes, best two or more with harmonics and their
-    errors; without the second harmonic neither 1:2 nor cubic terms are looked for. `model` with
-    both modes, its potential the terms that are known already (fitted too). Frequencies and damping
-    ratios whose 1σ the model states are fitted within it.
-    `level_gain_std` (relative) and `level_phase_std` (rad) as `calibrate_model` has them.
+    Arguments: `data` of sensors that observe both modes, best two or more with harmonics and their
+    errors; without the second harmonic, 1:2 and cubic terms are left out. `model` with both modes
+    and, in its potential, the terms already known (also fitted). Frequencies and damping ratios
+    with a stated 1σ are fitted with it as prior. `level_gain_std` (relative) and `level_phase_std`
+    (rad) as for `calibrate_model`.
     Returns `CoupledModes`; without a mode near a harmonic its `interactions` are empty and the
     mode's own stiffness is fitted.
     Raises what `calibrate_model` raises.
-    Validity: smooth stiffness; mode shapes and participations are taken as they are. A mode near
-    another harmonic than these, and one that no sensor tells apart, is not found.
+    Validity: smooth stiffness; mode shapes and participations are not fitted. Modes near other
+    harmonics, or indistinguishable at the sensors, are not identified.
     Not differentiable: differentiate `snrmjax.identify.identify_points`.
     Reference: evidence as in MacKay, Neural Comput. 4 (1992) 415, doi:10.1162/neco.1992.4.3.415;
-    the formulation with held modes is this package's own.
+    the formulation with prescribed modes is this package's own.
     """
     check_phases(data, "an identification of coupled modes")
     settings: dict[str, Any] = {
@@ -206,29 +208,29 @@ def coupled_modes(
         "level_gain_std": level_gain_std,
         "level_phase_std": level_phase_std,
     }
-    looked = []
+    assessed = []
     for pair in _candidates(data, model):
         terms = coupling_terms(pair.mode, pair.other, pair.ratio)
         if not _even_recorded(data):
-            # From zero a cubic term moves the fundamental to second order only.
+            # At zero a cubic term affects the fundamental to second order only.
             terms = tuple(term for term in terms if sum(term.powers) % 2 == 0)
         fit = _fitted(data, model, [term.key for term in terms], (pair.mode, pair.other), settings)
         chosen = _chosen(data, model, terms, fit)
-        looked.append((pair._replace(probability=chosen.coupled), terms, chosen, fit))
-    looked.sort(key=lambda one: -one[0].probability)
-    interactions = tuple(one[0] for one in looked)
+        assessed.append((pair._replace(probability=chosen.coupled), terms, chosen, fit))
+    assessed.sort(key=lambda one: -one[0].probability)
+    interactions = tuple(one[0] for one in assessed)
     coupled = bool(interactions) and interactions[0].probability > _COUPLED
     j = model.modes.mode_of_interest
     keys: Sequence[str] = [monomial_key((j,) * 4)]
-    held: tuple[int, ...] = (j,)
-    if looked:
-        pair, terms, chosen, _ = looked[0]
+    prescribed: tuple[int, ...] = (j,)
+    if assessed:
+        pair, terms, chosen, _ = assessed[0]
         kept = np.array([term.kept for term in terms])
         own = np.array([term.powers[1] == 0 for term in terms])
         best = chosen.best | kept if coupled else chosen.best & own
-        keys = [term.key for term, there in zip(terms, best, strict=True) if there] or keys
-        held = (pair.mode, pair.other)
-    final = _fitted(data, model, keys, held, settings)
+        keys = [term.key for term, used in zip(terms, best, strict=True) if used] or keys
+        prescribed = (pair.mode, pair.other)
+    final = _fitted(data, model, keys, prescribed, settings)
     return CoupledModes(
         calibration=final,
         interactions=interactions,
@@ -243,25 +245,25 @@ def _candidates(data: SteadyStates, model: Structure) -> list[Interaction]:
     """Other modes near a harmonic of the measured frequencies, each at its nearest ratio."""
     modes, j = model.modes, model.modes.mode_of_interest
     frequency = np.asarray(data.frequency)
-    found = []
+    candidates = []
     for k in modes.residual_modes:
-        away = {
+        detuning = {
             ratio: float(np.min(np.abs(modes.natural_frequency.item(k) / (ratio * frequency) - 1)))
             for ratio in RATIOS
         }
-        ratio = min(away, key=lambda r: away[r])
-        if away[ratio] > _NEAR or (ratio == _EVEN and not _even_recorded(data)):
+        ratio = min(detuning, key=lambda r: detuning[r])
+        if detuning[ratio] > _NEAR or (ratio == _EVEN and not _even_recorded(data)):
             continue
-        pair = Interaction(j, k, ratio, away[ratio], np.nan, np.nan)
-        found.append(pair._replace(fraction=_fraction(data, model, pair)))
-    return found
+        pair = Interaction(j, k, ratio, detuning[ratio], np.nan, np.nan)
+        candidates.append(pair._replace(fraction=_fraction(data, model, pair)))
+    return candidates
 
 
 def other_mode_moves(data: SteadyStates, model: Structure) -> bool:
-    """Whether sensors show a mode near a harmonic that moves more than the force alone moves it.
+    """Whether a mode near a harmonic moves more than the linear response to the force.
 
-    Beyond the errors of the states, and by a share that matters; False where fewer than two sensors
-    can tell.
+    Significantly over the errors of the states, and by a relevant fraction; False for fewer than
+    two sensors.
     """
     if len(data.sensors) < 2:
         return False
@@ -295,7 +297,7 @@ def _even_recorded(data: SteadyStates) -> bool:
 
 
 def _fraction(data: SteadyStates, model: Structure, pair: Interaction) -> float:
-    """The largest share of both modes' energy that the other has at its harmonic; NaN unseen."""
+    """Largest fraction of both modes' energy in the other mode at its harmonic; NaN if unknown."""
     motion = modal_motions(data, model, (pair.mode, pair.other))
     energy = np.nansum(np.abs(motion) ** 2, axis=(1, 2))
     order = (1, *data.harmonic_order)
@@ -307,18 +309,18 @@ def _fraction(data: SteadyStates, model: Structure, pair: Interaction) -> float:
 def modal_motions(
     data: SteadyStates, model: Structure, modes: Sequence[int]
 ) -> Complex[np.ndarray, "state mode order"]:
-    """Velocities of some modes (kg^1/2 m/s) as the sensors have them, at all recorded orders.
+    """Modal velocities (kg^1/2 m/s) from the sensors, at all recorded orders.
 
     Least squares over the sensors of each state; NaN where one was not measured.
     """
     fundamental = np.where(data.measured, data.velocity, np.nan)[..., None]
-    seen = np.concatenate([fundamental, np.asarray(data.harmonics)], axis=2)
+    observed = np.concatenate([fundamental, np.asarray(data.harmonics)], axis=2)
     inverse = np.linalg.pinv(np.asarray(model.modes.mode_shape)[:, list(modes)])
-    return np.einsum("ms,kso->kmo", inverse, seen)
+    return np.einsum("ms,kso->kmo", inverse, observed)
 
 
 def _with_terms(model: Structure, keys: Sequence[str]) -> Structure:
-    """The model with some terms in its potential, zero where it has them not."""
+    """The model with additional terms in its potential, starting at zero."""
     potential, n = model.potential, model.n_modes
     known = {
         monomial_key(m): float(value)
@@ -332,33 +334,35 @@ def _fitted(
     data: SteadyStates,
     model: Structure,
     keys: Sequence[str],
-    held: tuple[int, ...],
+    prescribed: tuple[int, ...],
     settings: dict[str, Any],
 ) -> CalibratedModel:
     wide = _with_terms(model, keys)
     names = [f"potential.{key}" for key in keys]
     fields = ("natural_frequency", "damping_ratio")
-    linear = [f"mode_{k + 1}.{field}" for k in held for field in fields]
+    linear = [f"mode_{k + 1}.{field}" for k in prescribed for field in fields]
     names += [name for name in linear if name in stated_stds(model)]
-    return calibrate_model(wide, data, names, priors=True, held_modes=held, **settings)
+    return calibrate_model(wide, data, names, priors=True, held_modes=prescribed, **settings)
 
 
 def _chosen(
     data: SteadyStates, model: Structure, terms: Sequence[CouplingTerm], fit: CalibratedModel
 ) -> ChosenTerms:
-    """Which terms of a fit with all of them are there."""
+    """Selection of terms from a fit with all of them."""
     n = len(terms)
     known = np.isfinite(np.diag(fit.covariance))[:n]
     information = np.zeros((n, n))
-    seen = np.flatnonzero(known)
-    information[np.ix_(seen, seen)] = np.linalg.inv(fit.covariance[np.ix_(seen, seen)])
+    observed = np.flatnonzero(known)
+    information[np.ix_(observed, observed)] = np.linalg.inv(
+        fit.covariance[np.ix_(observed, observed)]
+    )
     modes, j = model.modes, model.modes.mode_of_interest
     omega = modes.natural_frequency.item(j)
     motion = modal_motions(data, model, (j,))[:, 0, 0] if len(data.sensors) > 1 else None
     if motion is None:
         motion = np.asarray(data.velocity)[:, 0] / modes.mode_shape.item(0, j)
     amplitude = np.nanmax(np.abs(motion)) / omega
-    # A term may hold as much energy as the linear stiffness at the largest amplitude.
+    # Prior 1σ: as much energy as the linear stiffness at the largest amplitude.
     prior = np.array([omega**2 * amplitude ** (2 - sum(term.powers)) for term in terms])
     values = np.where(known, fit.values[:n], 0.0)
     return chosen_terms(terms, values, information, prior)

@@ -1,4 +1,4 @@
-"""Modes that exchange energy: their model, its responses, and what it says of the backbone."""
+"""Modes that exchange energy: their model, its responses, and the bias of one-mode backbones."""
 
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
@@ -16,13 +16,13 @@ from snrmjax.simulate.solutions.controlled import damped_normal_mode
 from snrmjax.simulate.solutions.forced_response import ResponseCurve, forced_response
 
 _POINTS = 50
-_BEYOND = 1.1  # of the largest velocity, to which the coupled mode is traced
+_BEYOND = 1.1  # times the largest velocity, up to which the coupled mode is traced
 
 
 class SingleModeBias(AbstractResult):
-    """Identified curves of one mode less those of the coupled modes, at the reference sensor.
+    """Bias of the identified one-mode curves against the coupled modes, at the reference sensor.
 
-    NaN beyond a turn of the coupled mode in amplitude: there it has several frequencies.
+    NaN beyond a fold of the coupled mode in amplitude, where it has several frequencies.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("velocity_m_s", "sensor")
@@ -34,7 +34,7 @@ class SingleModeBias(AbstractResult):
     damping_ratio: Float[np.ndarray, " point"] = quantity(
         "velocity_m_s", "1", "damping ratio of the coupled mode"
     )
-    # Over those of the coupled mode.
+    # Relative to those of the coupled mode.
     frequency_bias: Float[np.ndarray, " point"] = quantity(
         "velocity_m_s", "1", "relative error of the identified natural frequency"
     )
@@ -51,9 +51,9 @@ class SingleModeBias(AbstractResult):
 
     @property
     def at_largest(self) -> tuple[float, float, float, float]:
-        """Velocity (m/s), both biases and 1σ of that of the frequency at the largest amplitude.
+        """Velocity (m/s), both biases and 1σ of the frequency bias at the largest amplitude.
 
-        Of those where the coupled mode is known; NaN if there is none.
+        Among amplitudes where the coupled mode is known; NaN if there is none.
         """
         known = np.flatnonzero(np.isfinite(self.frequency_bias))
         if not known.size:
@@ -64,10 +64,10 @@ class SingleModeBias(AbstractResult):
 
 
 def single_mode_bias(identification: Identification, coupled: CoupledModes) -> SingleModeBias:
-    """How far the identified backbone and damping lie from those of the coupled modes.
+    """Bias of the identified backbone and damping against those of the coupled modes.
 
     The coupled modes' own curves are those of the damped nonlinear mode (`damped_normal_mode`) of
-    the fitted model: where the method's assumption holds, both agree.
+    the fitted model: where the one-mode assumption holds, both agree.
 
     Arguments: an identification of the same data, and the coupled modes fitted to them.
     Reference: Krack, Comput. Struct. 154 (2015) 59, doi:10.1016/j.compstruc.2015.03.008.
@@ -79,12 +79,14 @@ def single_mode_bias(identification: Identification, coupled: CoupledModes) -> S
     branch = damped_normal_mode(model, _BEYOND * float(np.nanmax(speed)))
     sensor = model.modes.sensors.index(backbone.sensor)
     fundamental = np.asarray(branch.velocity)[:, 1]
-    seen = np.abs(fundamental[:, sensor])
-    turns = np.flatnonzero(np.diff(seen) <= 0)
-    rising = slice(0, int(turns[0]) + 1 if turns.size else len(seen))
+    observed = np.abs(fundamental[:, sensor])
+    folds = np.flatnonzero(np.diff(observed) <= 0)
+    rising = slice(0, int(folds[0]) + 1 if folds.size else len(observed))
 
     def at_speed(part: np.ndarray) -> np.ndarray:
-        return np.interp(speed, seen[rising], np.asarray(part)[rising], left=np.nan, right=np.nan)
+        return np.interp(
+            speed, observed[rising], np.asarray(part)[rising], left=np.nan, right=np.nan
+        )
 
     mode = [at_speed(part) for part in (branch.frequency, branch.damping_ratio)]
     shapes = (fundamental / fundamental[:, [sensor]]).real
@@ -100,32 +102,35 @@ def single_mode_bias(identification: Identification, coupled: CoupledModes) -> S
     )
 
 
-_AROUND = (0.5, 1.0)  # of the measured range of frequencies, below and above it
-_STDS = 2.0  # of the identified curve, beyond which its bias is worth a note
+_AROUND = (
+    0.5,
+    1.0,
+)  # of the measured frequency range, by which a prediction extends below and above it
+_STDS = 2.0  # of the identified curve: a larger bias is reported as significant
 
 
 class CoupledDetails(NamedTuple):
-    """Coupled modes, what a backbone of one mode is wrong by, and predicted responses."""
+    """Coupled modes, the bias of a one-mode backbone, and predicted responses."""
 
     modes: CoupledModes
     bias: SingleModeBias
     responses: tuple[ResponseCurve, ...]
 
     def notes(self) -> list[Fact]:
-        """What a reader of the backbone must know."""
-        found, notes = self.modes.interaction, []
-        if found is None:
-            looked = self.modes.interactions
-            ratios = tuple((one.other + 1, one.ratio) for one in looked)
+        """Facts on the coupling and the bias of the backbone."""
+        interaction, notes = self.modes.interaction, []
+        if interaction is None:
+            assessed = self.modes.interactions
+            ratios = tuple((one.other + 1, one.ratio) for one in assessed)
             return [Fact("modes_not_coupled", looked=ratios)]
         notes.append(
             Fact(
                 "modes_coupled",
-                mode=found.mode + 1,
-                other=found.other + 1,
-                ratio=found.ratio,
-                probability=found.probability,
-                fraction=found.fraction,
+                mode=interaction.mode + 1,
+                other=interaction.other + 1,
+                ratio=interaction.ratio,
+                probability=interaction.probability,
+                fraction=interaction.fraction,
             )
         )
         velocity, frequency, damping, std = self.bias.at_largest
@@ -137,9 +142,9 @@ class CoupledDetails(NamedTuple):
 
 
 def coupled_details(
-    data: SteadyStates, model: Structure, found: Identification, forces: Sequence[float]
+    data: SteadyStates, model: Structure, identification: Identification, forces: Sequence[float]
 ) -> CoupledDetails:
-    """Coupled modes of a test, and their responses to some forces (N).
+    """Coupled modes of a test, and their responses to given forces (N).
 
     Raises what `coupled_modes` raises.
     """
@@ -151,4 +156,4 @@ def coupled_details(
     if forces:
         ends = max(low - _AROUND[0] * span, 0.5 * low), high + _AROUND[1] * span
         curves = forced_response(modes.model, list(dict.fromkeys(forces)), *ends)
-    return CoupledDetails(modes, single_mode_bias(found, modes), tuple(curves))
+    return CoupledDetails(modes, single_mode_bias(identification, modes), tuple(curves))

@@ -33,7 +33,7 @@ class SumOfPowers(AbstractFamily):
 
     @property
     def order(self) -> int:
-        """Number of terms beside the first."""
+        """Number of terms after the first."""
         return self.parameters.shape[0] - 1
 
     def terms(self) -> Terms:
@@ -53,14 +53,14 @@ class SumOfPowers(AbstractFamily):
 
 
 class Polynomial(SumOfPowers):
-    """An even polynomial: what any smooth force gives, in ascending powers of amplitude²."""
+    """An even polynomial, as any smooth force gives, in ascending powers of amplitude²."""
 
     kind: ClassVar[str] = "polynomial"
     orders: ClassVar[tuple[int, ...]] = (0, 1, 2, 3, 4)
 
     @property
     def size(self) -> int | None:
-        """See `AbstractFamily`: the number of terms beside the first."""
+        """See `AbstractFamily`: the number of terms after the first."""
         return self.order
 
     @classmethod
@@ -70,7 +70,7 @@ class Polynomial(SumOfPowers):
 
 
 class Constant(SumOfPowers):
-    """The same at every amplitude: the constant modal damping C of linear theory."""
+    """Constant in amplitude: the modal damping C of linear theory."""
 
     kind: ClassVar[str] = "constant"
     orders: ClassVar[tuple[int, ...]] = (0,)
@@ -78,7 +78,7 @@ class Constant(SumOfPowers):
 
 
 class ViscousQuadratic(SumOfPowers):
-    """Viscous and quadratic damping: c|q̇|q̇ acts on the fundamental like 8cv/(3π)."""
+    """Viscous and quadratic damping: c|q̇|q̇ is equivalent to 8cv/(3π) on the fundamental."""
 
     kind: ClassVar[str] = "viscous_quadratic"
     orders: ClassVar[tuple[int, ...]] = (1,)
@@ -86,7 +86,7 @@ class ViscousQuadratic(SumOfPowers):
 
 
 class ViscousCoulomb(SumOfPowers):
-    """Viscous damping and dry friction: μ sign(q̇) acts on the fundamental like 4μ/(πv)."""
+    """Viscous damping and dry friction: μ sign(q̇) is equivalent to 4μ/(πv) on the fundamental."""
 
     kind: ClassVar[str] = "viscous_coulomb"
     orders: ClassVar[tuple[int, ...]] = (1,)
@@ -94,13 +94,13 @@ class ViscousCoulomb(SumOfPowers):
 
 
 class PowerLaw(AbstractFamily):
-    """A value at zero and a power of amplitude whose positive exponent is free.
+    """A value at zero and a power of amplitude with free positive exponent.
 
-    The exponent may be anywhere in its range: the logarithm of its odds is expected within
-    `odds_std` of zero, or it would run away where data want it at an end, and take the bands along.
+    The exponent is bounded by a logistic map; its log odds have a prior 1σ of `odds_std`, without
+    which they would diverge where the data favour a bound, and the bands with them.
     """
 
-    odds_std: ClassVar[float] = 5.0  # an exponent of 99 % of its range is at one of these
+    odds_std: ClassVar[float] = 5.0  # 1σ is an exponent at 99 % of its range
     kind: ClassVar[str] = "power_law"
     orders: ClassVar[tuple[int, ...]] = (1,)
     largest_exponent: ClassVar[float] = 6.0
@@ -141,9 +141,9 @@ class PowerLaw(AbstractFamily):
 
 
 class ViscousMicroslip(PowerLaw):
-    """Viscous damping and microslip in joints, whose loss grows by a power between 2 and 3.
+    """Viscous damping and microslip in joints, dissipation with a power between 2 and 3.
 
-    Iwan's joints dissipate amplitude^(3+χ) with −1 < χ < 0 in a cycle, so that 2ζ̃ω̃ grows with
+    Iwan's joints dissipate ∝ amplitude^(3+χ) per cycle with −1 < χ < 0, so that 2ζ̃ω̃ grows with
     the power 1 + χ, between zero and one. Reference: Segalman, J. Appl. Mech. 72 (2005) 752,
     doi:10.1115/1.1989354.
     """
@@ -181,7 +181,7 @@ ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 
 
 class Choice(NamedTuple):
-    """What the user fixed of a family."""
+    """The user's choice of a family."""
 
     kind: str  # or "auto"
     size: int | None
@@ -189,9 +189,9 @@ class Choice(NamedTuple):
 
 
 def parse_family(text: str) -> Choice:
-    """Family, size and amplitude of "spline:5@velocity"; what is not said is None.
+    """Family, size and amplitude of "spline:5@velocity"; None for parts not given.
 
-    Raises `ValueError` for what is no family.
+    Raises `ValueError` for an unknown family, size or amplitude.
     """
     head, _, argument = text.partition("@")
     kind, _, size = head.partition(":")
@@ -205,19 +205,19 @@ def parse_family(text: str) -> Choice:
     return Choice(kind, int(size) if size else None, known[argument])
 
 
-_LEAST = 1e-6  # of the largest amplitude: terms such as tanh(x)/x have no value at rest
-_LOGARITHM_STD = 3.0  # of a number: within a factor of twenty of one
-_KNOTS, _REACH = 64, 1.3  # of what programs draw, up to so many times the largest amplitude
+_LEAST = 1e-6  # of the largest amplitude: tanh(x)/x and the like are 0/0 at rest
+_LOGARITHM_STD = 3.0  # prior 1σ of ln of a number: a factor of twenty
+_KNOTS, _REACH = 64, 1.3  # of the spline in programs; its end over the largest amplitude
 
 
 class OwnFamily(AbstractFamily):
     """ω̃² or 2ζ̃ω̃ as Σ p_k h_k(x; numbers) of the amplitude x over the largest measured one.
 
-    A subclass has a `kind`, `names` of its terms, `numbers` that they contain, each with the
-    positive values at which a fit begins, and `columns`. Added to `sj.identify.FAMILIES` under its
-    kind, `fit_jointly` takes it by name. Numbers are unknowns by their logarithm, within a factor
-    of twenty of one (1σ). What predicts responses draws the curve as a natural spline through 64
-    values, and follows the numbers to first order.
+    A subclass has a `kind`, `names` of its terms, the nonlinear parameters `numbers`, each with its
+    positive starting values, and `columns`. Added to `sj.identify.FAMILIES` under its kind,
+    `fit_jointly` takes it by name. Numbers are unknowns by their logarithm, with a prior 1σ of a
+    factor of twenty about one. Response prediction uses a natural spline through 64 values of the
+    curve, linearised in the numbers.
     """
 
     names: ClassVar[tuple[str, ...]]
@@ -227,7 +227,7 @@ class OwnFamily(AbstractFamily):
     @classmethod
     @abstractmethod
     def columns(cls, x: Float[Array, "*batch"], **numbers: Float[Array, ""]) -> list[Array]:
-        """The terms h_k at relative amplitudes x > 0, as JAX computes them, in the order of
+        """The terms h_k at relative amplitudes x > 0, in JAX operations and in the order of
         `names`.
         """
 
@@ -236,14 +236,16 @@ class OwnFamily(AbstractFamily):
         x = jnp.maximum(jnp.asarray(amplitude) / self.scale, _LEAST)
         own, n = jnp.asarray(self.parameters), len(self.names)
         terms = self.columns(x, **dict(zip(self.numbers, jnp.exp(own[n:]), strict=True)))
-        return sum((size * term for size, term in zip(own[:n], terms, strict=True)), 0.0 * x)
+        return sum(
+            (coefficient * term for coefficient, term in zip(own[:n], terms, strict=True)), 0.0 * x
+        )
 
     def linearised(
         self,
         amplitude: Float[np.ndarray, " point"],
         parameters: Float[np.ndarray, " parameter"] | None = None,
     ) -> Linearised:
-        """See `AbstractFamily`; compiles, once for each number of points."""
+        """See `AbstractFamily`; compiles once per number of points."""
         there = self if parameters is None else self.at(parameters)
         return AbstractCurve.linearised(there, amplitude)
 
@@ -267,7 +269,7 @@ class OwnFamily(AbstractFamily):
 
     @classmethod
     def starts(cls, order: int, near: Scattered) -> list[AbstractFamily]:
-        """See `AbstractFamily`: one at every combination of its numbers."""
+        """See `AbstractFamily`: one at every combination of starting values of the numbers."""
         members: list[AbstractFamily] = []
         n, scale = len(cls.names), jnp.asarray(near.largest)
         for numbers in itertools.product(*cls.numbers.values()):

@@ -1,7 +1,7 @@
-"""What every curve of amplitude is made of: powers and hats, on the host and in programs alike.
+"""Base of all curves of amplitude: powers and spline functions, in NumPy and JAX alike.
 
 Every member of a family is ω̃²(amplitude) in rad²/s² or 2ζ̃ω̃(amplitude) in 1/s. Its parameters are
-what its terms contribute at the largest measured amplitude, so that all have the unit of the value.
+the contributions of its terms at the largest measured amplitude, all in the unit of the curve.
 """
 
 import dataclasses
@@ -25,15 +25,15 @@ _KIND_WORDS = {
     "viscous_coulomb": "viscous and Coulomb damping",
     "viscous_microslip": "viscous and microslip damping",
 }
-_FAR = 1e6  # (amplitude/scale)² of a knot that is none
-_SIZE = 12  # parameters and powers in programs; a larger family takes a multiple of it
+_FAR = 1e6  # (amplitude/scale)² of padding knots
+_SIZE = 12  # parameters and powers are padded to multiples of it
 
 
 class Coefficient(NamedTuple):
     """A parameter of a family."""
 
     name: str
-    is_value: bool  # False: a number without unit, such as an exponent
+    is_value: bool  # False: dimensionless, such as an exponent
 
 
 class Terms(NamedTuple):
@@ -41,15 +41,15 @@ class Terms(NamedTuple):
 
     exponents: Float[Array | np.ndarray, " term"]
     is_free: Bool[Array | np.ndarray, " term"]  # the exponent is the third parameter's
-    largest_exponent: Float[Array, ""] | float  # of a free one; its share is a logistic function
+    largest_exponent: Float[Array, ""] | float  # of a free exponent, times a logistic function
     knots: Float[Array | np.ndarray, " knot"]
     mix: Float[Array | np.ndarray, "basis parameter"]  # from parameters to coefficients
-    prior: Float[Array | np.ndarray, "row parameter"]  # what is expected near zero, in its 1σ
-    offset: Float[Array | np.ndarray, "*basis"] | float = 0.0  # of the coefficients, known
+    prior: Float[Array | np.ndarray, "row parameter"]  # prior residuals, in their 1σ
+    offset: Float[Array | np.ndarray, "*basis"] | float = 0.0  # constant part of the coefficients
 
     @classmethod
     def of_powers(cls, exponents: list[float], n_parameters: int | None = None) -> "Terms":
-        """Powers alone, each with its parameter; further parameters are none's."""
+        """Powers alone, each with its parameter; further parameters have no term."""
         n = len(exponents) if n_parameters is None else n_parameters
         powers, free = np.array(exponents, dtype=float), np.zeros(len(exponents), dtype=bool)
         return cls(powers, free, 1.0, np.zeros(0), np.eye(len(exponents), n), np.zeros((0, n)))
@@ -59,23 +59,23 @@ class Linearised(NamedTuple):
     """A curve at some amplitudes, with its derivatives."""
 
     value: Any
-    by_parameters: Any  # one more axis
+    by_parameters: Any  # trailing axis of parameters
     by_amplitude: Any
 
 
-class _Drawn(NamedTuple):
-    """A curve at some x, and what its derivatives are made of."""
+class _Evaluated(NamedTuple):
+    """A curve at given x, and the quantities that its derivatives need."""
 
     value: Any
-    basis: Any  # one more axis
+    basis: Any  # trailing axis of terms
     by_x: Any
-    by_third: Any  # by the third parameter, beside what it does to the coefficients
+    by_third: Any  # by the third parameter as an exponent, besides its coefficient
 
 
-def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> _Drawn:
-    """By NumPy or JAX, as `xp` says."""
+def _evaluated(x: Any, parameters: Any, terms: Terms, xp: Any) -> _Evaluated:
+    """The curve in NumPy or JAX (`xp`)."""
     n, has_third = len(terms.exponents), parameters.shape[0] > 2
-    bent, by_u = hats(x**2, terms.knots, xp)
+    hat_values, by_u = hats(x**2, terms.knots, xp)
     x = x[..., None]
     known = x > 0
     inside = xp.where(known, x, 1.0)
@@ -84,31 +84,31 @@ def _drawn(x: Any, parameters: Any, terms: Terms, xp: Any) -> _Drawn:
     powers = inside**exponents
     at_rest = xp.where(exponents == 0, 1.0, 0.0)
     rising = xp.where(known, exponents * powers / inside, xp.where(exponents == 1, 1.0, 0.0))
-    basis = xp.concatenate([xp.where(known, powers, at_rest), bent], axis=-1)
+    basis = xp.concatenate([xp.where(known, powers, at_rest), hat_values], axis=-1)
     slopes = xp.concatenate([rising, 2 * x * by_u], axis=-1)
     coefficients = terms.mix @ parameters + terms.offset
     by_exponent = xp.where(known & terms.is_free, powers * xp.log(inside), 0.0) @ coefficients[:n]
     by_third = terms.largest_exponent * fraction * (1 - fraction) * by_exponent
-    # Dry friction: its equivalent damping grows without bound towards rest.
+    # Dry friction: its equivalent damping ∝ 1/v is infinite at rest.
     dry = xp.sum(xp.where(terms.exponents < 0, coefficients[:n], 0.0))
-    endless = (dry != 0) & (x[..., 0] <= 0)
-    value = xp.where(endless, xp.copysign(xp.inf, dry), basis @ coefficients)
-    return _Drawn(value, basis, slopes @ coefficients, by_third)
+    infinite = (dry != 0) & (x[..., 0] <= 0)
+    value = xp.where(infinite, xp.copysign(xp.inf, dry), basis @ coefficients)
+    return _Evaluated(value, basis, slopes @ coefficients, by_third)
 
 
 @jax.custom_jvp
 def _value(x: Array, parameters: Array, terms: Terms) -> Array:
-    return _drawn(x, parameters, terms, jnp).value
+    return _evaluated(x, parameters, terms, jnp).value
 
 
 @_value.defjvp
 def _value_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """One basis serves all directions, where automatic rules would draw its powers for each.
+    """The basis is evaluated once for all tangents, where automatic rules would repeat it for each.
 
-    Terms have no derivative: they are chosen, not fitted.
+    Terms are chosen, not fitted: they have no derivative.
     """
     (x, parameters, terms), (by_x, by_parameters, _) = primals, tangents
-    drawn = _drawn(x, parameters, terms, jnp)
+    drawn = _evaluated(x, parameters, terms, jnp)
     slope = drawn.by_x * by_x + drawn.basis @ (terms.mix @ by_parameters)
     if parameters.shape[0] > 2:
         slope = slope + drawn.by_third * by_parameters[2]
@@ -118,8 +118,8 @@ def _value_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def hats(u: Any, knots: Any, xp: Any) -> tuple[Any, Any]:
     """Functions whose second derivative is a hat over three successive knots, and their slopes.
 
-    Straight outside of their hat and made of clipped differences: nothing large cancels, as it
-    does in sums of truncated powers. Arguments: `xp` NumPy or JAX's.
+    Linear outside of the hat, and formed from clipped differences: no cancellation, unlike sums of
+    truncated powers. Arguments: `xp` is NumPy or JAX's.
     """
     u = u[..., None]
     left, middle, right = knots[:-2], knots[1:-1], knots[2:]
@@ -132,14 +132,14 @@ def hats(u: Any, knots: Any, xp: Any) -> tuple[Any, Any]:
 
 
 class AbstractCurve(eqx.Module):
-    """A curve of amplitude with parameters that a fit may move."""
+    """A curve of amplitude with fitted parameters."""
 
     parameters: Float[Array, " parameter"]
     scale: Float[Array, ""]  # the largest measured amplitude, m or m/s
 
     @abstractmethod
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """Value at the amplitude that is its own, exact in the limit of zero."""
+        """Value at amplitudes of its argument, exact in the limit of zero."""
 
     def linearised(self, amplitude: Float[np.ndarray, " point"]) -> Linearised:
         """Values and derivatives by the parameters and by the amplitude, on the host."""
@@ -151,15 +151,15 @@ def _by_program(curve: AbstractCurve, at: Array) -> Linearised:
     def of(parameters: Array, at: Array) -> Array:
         return eqx.tree_at(lambda f: f.parameters, curve, parameters)(at)
 
-    # Every amplitude has its own value: one push forward along ones gives all slopes.
+    # Values depend on their own amplitude only: one forward-mode product gives all slopes.
     value, slope = jax.jvp(lambda at: of(curve.parameters, at), (at,), (jnp.ones_like(at),))
     return Linearised(value, jax.jacfwd(of)(curve.parameters, at), slope)
 
 
 class PackedCurve(AbstractCurve):
-    """Terms of any family in arrays of one size: one compiled program then serves them all.
+    """Terms of any family padded to one size, so that one compiled program serves all.
 
-    What a family does not have is multiplied by zero: parameters beyond its own move nothing.
+    Padding is multiplied by zero: parameters beyond the family's own have no effect.
     """
 
     made_of: Terms
@@ -170,16 +170,16 @@ class PackedCurve(AbstractCurve):
         return _value(jnp.asarray(amplitude) / self.scale, self.parameters, self.made_of)
 
     def amplitude(self, displacement: Array, velocity: Array) -> Array:
-        """The one of the two amplitudes that this curve is a function of."""
+        """The amplitude that this curve is a function of."""
         return jnp.where(self.of_velocity, velocity, displacement)
 
     def prior_residuals(self) -> Float[Array, " row"]:
-        """What is expected to be near zero of a curve, in its own 1σ."""
+        """Prior residuals of the curve, in units of their 1σ."""
         return jnp.asarray(self.made_of.prior @ self.parameters)
 
 
 class Scattered(NamedTuple):
-    """Points that a family begins near, over one of the two amplitudes."""
+    """Weighted points of a curve, from which a family is started."""
 
     argument: Argument
     amplitude: Float[np.ndarray, " point"]
@@ -192,34 +192,34 @@ class Scattered(NamedTuple):
         return float(np.max(self.amplitude))
 
     def fitted(self, columns: Float[np.ndarray, "point column"]) -> Float[np.ndarray, " column"]:
-        """Coefficients of columns, nearest to the weighted values."""
+        """Weighted least-squares coefficients of columns."""
         weighted, goal = columns * self.weight[:, None], self.values * self.weight
         return np.asarray(np.linalg.lstsq(weighted, goal, rcond=1e-10)[0])
 
 
 class AbstractFamily(AbstractCurve):
-    """A curve of amplitude by name; `argument` says of which amplitude."""
+    """A named curve of amplitude, displacement or velocity (`argument`)."""
 
     kind: ClassVar[str]
-    orders: ClassVar[tuple[int, ...]]  # sizes that a selection by data tries, simplest first
+    orders: ClassVar[tuple[int, ...]]  # sizes that selection tries, simplest first
     argument: Argument = eqx.field(static=True)
 
     @abstractmethod
     def terms(self) -> Terms:
-        """What the curve is made of, over the amplitude by `scale`."""
+        """The terms of the curve in amplitude/`scale`."""
 
     @abstractmethod
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """What the parameters are called, and which are values."""
+        """Names of the parameters, and which are values of the curve."""
 
     @classmethod
     @abstractmethod
     def starts(cls, order: int, near: Scattered) -> list["AbstractFamily"]:
-        """Members near scattered points: one where the family is linear, several elsewhere."""
+        """Members fitted to scattered points: one where the family is linear, else several."""
 
     @property
     def size(self) -> int | None:
-        """The size that is said beside the family's name; None where there is but one."""
+        """The size given with the family's name; None where there is only one."""
         return None
 
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -231,22 +231,22 @@ class AbstractFamily(AbstractCurve):
         amplitude: Float[np.ndarray, " point"],
         parameters: Float[np.ndarray, " parameter"] | None = None,
     ) -> Linearised:
-        """See `AbstractCurve`; nothing compiles. For other `parameters`, if given."""
+        """See `AbstractCurve`; without compilation. For other `parameters`, if given."""
         host = jax.tree.map(np.asarray, self)
         scale, terms = float(host.scale), host.terms()
         own = host.parameters if parameters is None else parameters
-        drawn = _drawn(np.asarray(amplitude) / scale, own, terms, np)
+        drawn = _evaluated(np.asarray(amplitude) / scale, own, terms, np)
         columns = drawn.basis @ terms.mix
         if columns.shape[-1] > 2:
             columns[..., 2] += drawn.by_third
         return Linearised(drawn.value, columns, drawn.by_x / scale)
 
     def amplitude(self, displacement: Array, velocity: Array) -> Array:
-        """The one of the two amplitudes that this curve is a function of."""
+        """The amplitude that this curve is a function of."""
         return displacement if self.argument == "displacement" else velocity
 
     def prior_residuals(self) -> Float[Array, " row"]:
-        """What is expected to be near zero of a curve, in its own 1σ."""
+        """Prior residuals of the curve, in units of their 1σ."""
         return jnp.asarray(self.terms().prior @ self.parameters)
 
     def at(self, parameters: Float[np.ndarray, " parameter"]) -> Self:
@@ -254,7 +254,7 @@ class AbstractFamily(AbstractCurve):
         return dataclasses.replace(self, parameters=jax.device_put(parameters))
 
     def expected_std(self) -> Float[np.ndarray, " parameter"]:
-        """1σ about zero of what is expected of every parameter; infinite where nothing is."""
+        """Prior 1σ about zero of every parameter; infinite where flat."""
         rows = np.linalg.norm(np.asarray(self.terms().prior), axis=0)
         return np.divide(1.0, rows, out=np.full(len(rows), np.inf), where=rows > 0)
 
@@ -273,14 +273,14 @@ class AbstractFamily(AbstractCurve):
         if "spline" in self.kind:
             sized = f", {self.size} knots"
         elif self.kind == "polynomial":
-            sized = f", {self.size} {'term' if self.size == 1 else 'terms'} beside the constant"
+            sized = f", {self.size} {'term' if self.size == 1 else 'terms'} plus a constant"
         return f"{_KIND_WORDS.get(self.kind, self.kind)} of {self.argument}{sized}"
 
 
 def packed(family: AbstractFamily, room: int = 0) -> PackedCurve:
-    """The same curve in arrays of one size, with room for so many parameters at least.
+    """The same curve padded to one size, with room for at least `room` parameters.
 
-    On the host, where nothing compiles for one more size, if it can be.
+    On the host where possible, which compiles nothing for a new size.
     """
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(family))
     xp: Any = jnp if traced else np

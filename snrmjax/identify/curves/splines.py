@@ -18,15 +18,15 @@ from snrmjax.identify.curves.family_base import (
     hats,
 )
 
-_CROWD = 4  # states between two knots, at most
-_CLOSEST = 1.003  # ratio of knots' amplitudes: velocities are hardly known better
+_CROWD = 4  # states between two knots at most
+_CLOSEST = 1.003  # ratio of knots' amplitudes: about the accuracy of velocities
 
 
 class Spline(AbstractFamily):
     """A natural cubic spline in amplitude², through values at knots; the first knot is at zero.
 
-    Drawn by `hats`, and not by intervals: the program is a tenth of what a search for intervals
-    and its derivatives compile to.
+    Evaluated as a sum of `hats`, which compiles to a tenth of an interval search with its
+    derivatives.
     """
 
     kind: ClassVar[str] = "spline"
@@ -51,10 +51,10 @@ class Spline(AbstractFamily):
 
     @classmethod
     def starts(cls, order: int, near: Scattered) -> list[AbstractFamily]:
-        """See `AbstractFamily`; knots at zero and where the amplitudes divide into equal parts."""
+        """See `AbstractFamily`; knots at zero and at quantiles of the amplitudes."""
         scale = near.largest
         fractions = np.quantile(near.amplitude / scale, np.linspace(0, 1, order)[1:])
-        # Knots that coincide, of levels at one amplitude, are drawn apart evenly instead.
+        # Coinciding knots, from levels at one amplitude, are replaced by even ones.
         knots = np.concatenate([[0.0], fractions**2])
         if np.min(np.diff(knots)) < 0.02 / order:
             knots = np.linspace(0.0, 1.0, order) ** 2
@@ -77,24 +77,24 @@ class Spline(AbstractFamily):
 
 
 class SmoothingSpline(Spline):
-    """A natural cubic spline with many knots that is as smooth as the data ask for.
+    """A natural cubic spline with many knots and a roughness penalty.
 
-    Its bends, the differences of a value from the straight line between those at the next knots,
-    have a prior 1σ, one for all or one that changes along the curve, which the model of a test
-    finds (`test_model`). A band then covers what the curve may do between knots; with few free
-    knots it does not cover what they cannot follow. Knots are many, about evenly spaced in the
-    logarithm of amplitude: steps of damping as joints begin to slip lie between levels too.
+    Its roughness, the distance of a value from the chord between its neighbours, has a prior 1σ,
+    constant or varying along the curve, estimated by the model of a test (`test_model`). The band
+    then covers the curve between knots as well; with few free knots it misses their interpolation
+    error. Knots are about evenly spaced in log amplitude: the damping steps of joints that begin to
+    slip may lie between levels.
     Reference: Nychka, J. Am. Stat. Assoc. 83 (1988) 1134, doi:10.1080/01621459.1988.10478711.
     """
 
     kind: ClassVar[str] = "smoothing_spline"
     orders: ClassVar[tuple[int, ...]] = (12,)
-    roughness: Float[Array, "bend knot"]  # from values at the knots
-    roughness_std: Float[Array, "*bend"]  # 1σ of the bends, one for all or each its own
+    roughness: Float[Array, "curvature knot"]  # from values at the knots
+    roughness_std: Float[Array, "*curvature"]  # 1σ of the roughness, common or at each knot
 
     def terms(self) -> Terms:
         """See `AbstractFamily`."""
-        # One 1σ for all bends, or one each.
+        # A common 1σ, or one at each inner knot.
         return super().terms()._replace(prior=self.roughness / self.roughness_std[..., None])
 
     @classmethod
@@ -104,7 +104,7 @@ class SmoothingSpline(Spline):
         values: Float[np.ndarray, " knot"],
         scale: Float[Array, ""],
         argument: Argument,
-        roughness_std: Float[np.ndarray, " bend"] | float = np.inf,
+        roughness_std: Float[np.ndarray, " curvature"] | float = np.inf,
     ) -> "SmoothingSpline":
         """See `Spline`; without `roughness_std` any roughness is equally likely."""
         mix = np.linalg.inv(spline_terms(knots, knots))
@@ -115,28 +115,28 @@ class SmoothingSpline(Spline):
 def amplitudes_apart(
     amplitude: Float[np.ndarray, " point"], most: int, ratio: float, *, crowded: bool = False
 ) -> Float[np.ndarray, " knot"]:
-    """Some of the amplitudes in rising order, each at least so many times the one below.
+    """A subset of the amplitudes in rising order, neighbours at least a factor `ratio` apart.
 
-    With `crowded` also every `_CROWD`th where amplitudes crowd: a curve that is steep there keeps
-    the amplitudes of many states alike, as a wire that meets a critical velocity.
+    With `crowded` also every `_CROWD`th where amplitudes cluster, as they do where a curve is
+    steep: a wire at a critical velocity.
 
-    Arguments: `amplitude` relative to the largest; of more than `most` even picks.
+    Arguments: `amplitude` relative to the largest; more than `most` are thinned evenly.
     """
     apart, since = [1.0], 0
-    for size in np.sort(amplitude)[::-1]:
+    for value in np.sort(amplitude)[::-1]:
         since += 1
-        if 0 < size * (_CLOSEST if crowded and since >= _CROWD else ratio) <= apart[-1]:
-            apart.append(float(size))
+        if 0 < value * (_CLOSEST if crowded and since >= _CROWD else ratio) <= apart[-1]:
+            apart.append(float(value))
             since = 0
     pick = np.linspace(0, len(apart) - 1, min(most, len(apart)))
     return np.array(apart)[np.round(pick).astype(int)][::-1]
 
 
-def roughness_of(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:
-    """Change of slope at every inner knot, times the mean distance to its neighbours.
+def roughness_of(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "curvature knot"]:
+    """Roughness matrix: change of slope at every inner knot, times the mean knot spacing there.
 
-    A bend's variance is expected to grow with that distance, counted in logarithms of amplitude:
-    in units of the mean one.
+    Scaled for a prior variance that grows with the spacing in log amplitude, relative to the mean
+    spacing.
     """
     gap, amplitude = np.diff(knots), np.sqrt(knots)
     matrix = np.zeros((len(gap) - 1, len(knots)))
@@ -144,22 +144,22 @@ def roughness_of(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend k
         mean = 0.5 * (below + above)
         matrix[k, k : k + 3] = mean * np.array([1 / below, -1 / below - 1 / above, 1 / above])
     reach = np.log(amplitude[2:] / np.maximum(amplitude[:-2], 0.5 * amplitude[1:-1]))
-    mean = np.mean(reach) if reach.size else 1.0  # two knots have no bend between them
+    mean = np.mean(reach) if reach.size else 1.0  # two knots have no inner knot
     return matrix / np.sqrt(reach / mean)[:, None]
 
 
 def spline_terms(
     u: Float[np.ndarray, " point"], knots: Float[np.ndarray, " knot"]
 ) -> Float[np.ndarray, "point term"]:
-    """1, u and the `hats` at some points u, on the host."""
+    """1, u and the `hats` at points u, on the host."""
     return np.column_stack([np.ones_like(u), u, hats(u, knots, np)[0]])
 
 
 class WithRemainder(AbstractFamily):
-    """A curve by a family, and the natural spline in amplitude² that the family leaves.
+    """A family plus a smooth remainder, a natural spline in amplitude².
 
-    Its parameters are the family's, then the coefficients of smooth functions (a straight line and
-    curvatures), which are expected within `std` of zero.
+    Its parameters are the family's, then the coefficients of the smooth functions (a straight line
+    and curvatures), which have the prior 1σ `std`.
     """
 
     kind: ClassVar[str] = "with_remainder"
@@ -182,7 +182,7 @@ class WithRemainder(AbstractFamily):
         theirs = np.asarray(family.terms().knots)
         union = np.unique(np.concatenate([knots, theirs]))
         terms = np.linalg.solve(spline_terms(knots, knots), functions)
-        # The second derivative of a natural spline is straight between its knots.
+        # The second derivative of a natural spline is piecewise linear.
         inner = union[1:-1]
         mix = np.vstack([terms[:2], _hats_at(inner, knots) @ terms[2:]])
         own = _hats_at(inner, theirs)
@@ -212,17 +212,17 @@ class WithRemainder(AbstractFamily):
 
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
-        left = (Coefficient(f"remainder_{k}", True) for k in range(len(self.std)))
-        return (*self.family.coefficients(), *left)
+        remainder = (Coefficient(f"remainder_{k}", True) for k in range(len(self.std)))
+        return (*self.family.coefficients(), *remainder)
 
     @classmethod
     def starts(cls, *_: Any) -> list[AbstractFamily]:
-        """See `AbstractFamily`: none without a family to begin with."""
+        """See `AbstractFamily`: none, as it needs a fitted family."""
         return []
 
     @property
     def largest_remainder(self) -> float:
-        """The largest that the family leaves at measured amplitudes, over the curve there."""
+        """Largest relative remainder at measured amplitudes."""
         knots = np.asarray(self.knots)
         at = np.sqrt(knots[(knots > 0) & (knots <= 1)]) * float(self.scale)
         whole = self.linearised(at).value
@@ -232,7 +232,7 @@ class WithRemainder(AbstractFamily):
 
     @property
     def label(self) -> str:
-        """See `AbstractFamily`: the family's."""
+        """See `AbstractFamily`: that of the family."""
         return self.family.label
 
     @property
@@ -244,7 +244,7 @@ class WithRemainder(AbstractFamily):
 def _hats_at(
     inner: Float[np.ndarray, " knot"], knots: Float[np.ndarray, " own"]
 ) -> Float[np.ndarray, "knot hat"]:
-    """Second derivatives at some points of the `hats` of other knots."""
+    """Second derivatives of the `hats` of other knots at these points."""
     if len(knots) < 3:
         return np.zeros((len(inner), 0))
     each = np.eye(len(knots))[1:-1]

@@ -1,1 +1,1 @@
-"""What a joint fit says: curves and responses with bands, and what to measure next."""
+"""Results of a joint fit: curves and responses with bands, and the next measurements."""

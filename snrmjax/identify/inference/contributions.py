@@ -1,4 +1,4 @@
-"""What the uncertainty of a joint fit comes from: shares of every source of error."""
+"""Error budget of a joint fit: contribution of every source to the variance."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, overload
@@ -22,7 +22,7 @@ Row = TypeVar("Row")
 class AbstractTable(AbstractResult, Generic[Row]):
     """A result that is a sequence of rows, each a `NamedTuple`."""
 
-    # Of a row, unit and meaning.
+    # Value of a row, unit and meaning.
     columns: ClassVar[Mapping[str, tuple[Callable[[Any], Any], str, str]]]
     rows: tuple[Row, ...]
 
@@ -31,19 +31,19 @@ class AbstractTable(AbstractResult, Generic[Row]):
         return len(self.rows)
 
     @overload
-    def __getitem__(self, place: int) -> Row: ...
+    def __getitem__(self, index: int) -> Row: ...
     @overload
-    def __getitem__(self, place: slice) -> tuple[Row, ...]: ...
-    def __getitem__(self, place: int | slice) -> Row | tuple[Row, ...]:
-        """The row at a place, or those of a slice."""
-        return self.rows[place]
+    def __getitem__(self, index: slice) -> tuple[Row, ...]: ...
+    def __getitem__(self, index: int | slice) -> Row | tuple[Row, ...]:
+        """The row at an index, or the rows of a slice."""
+        return self.rows[index]
 
     def __iter__(self) -> Iterator[Row]:
         """The rows in their order."""
         return iter(self.rows)
 
     def variables(self) -> dict[str, Variable]:
-        """One of every entry of `columns`."""
+        """One variable per entry of `columns`."""
         return {
             name: Variable(("row",), np.array([of(row) for row in self.rows]), unit, meaning)
             for name, (of, unit, meaning) in self.columns.items()
@@ -51,21 +51,21 @@ class AbstractTable(AbstractResult, Generic[Row]):
 
 
 _LISTED = 8  # sources on one screen
-_OWN = ("stiffness off resonance", "damping off resonance", "modal mass")
-_AMPLITUDES = 25  # at which shares are taken
+_OTHER = ("stiffness off resonance", "damping off resonance", "modal mass")
+_AMPLITUDES = 25  # at which the variance is evaluated
 
 
 class Contribution(NamedTuple):
-    """What one source of error contributes to the band of a curve."""
+    """Contribution of one source of error to the bands of both curves."""
 
     source: str
     frequency_fraction: float  # of the variance of ω̃, mean over amplitudes
     damping_fraction: float  # of the variance of 2ζ̃ω̃
-    kind: str  # of source: what all levels, or all linear parameters, have in common
+    kind: str  # of source, such as "gain of levels"
 
 
 class Contributions(AbstractTable[Contribution]):
-    """Shares of the variance of both bands by source of error, the largest first."""
+    """Fractions of the variance of both bands by source of error, the largest first."""
 
     coordinates = ("source",)
     columns: ClassVar = {
@@ -73,9 +73,13 @@ class Contributions(AbstractTable[Contribution]):
         "kind": (lambda row: row.kind, "", "kind of source"),
         "frequency_fraction": (
             lambda row: row.frequency_fraction,
-            *("1", "share of the natural frequency's variance"),
+            *("1", "fraction of the natural frequency's variance"),
         ),
-        "damping_fraction": (lambda row: row.damping_fraction, "1", "share of the variance of 2ζω"),
+        "damping_fraction": (
+            lambda row: row.damping_fraction,
+            "1",
+            "fraction of the variance of 2ζω",
+        ),
     }
 
     def summary(self) -> tuple[str, ...]:
@@ -93,7 +97,7 @@ class Contributions(AbstractTable[Contribution]):
         )
 
     def by_kind(self) -> "Contributions":
-        """The same with the sources of one kind together, the largest first.
+        """Contributions summed by kind of source, the largest first.
 
         >>> gain = Contribution("gain of level 1", 0.2, 0.1, "gain of levels")
         >>> rows = gain, gain._replace(source="gain of level 2")
@@ -113,8 +117,8 @@ class Contributions(AbstractTable[Contribution]):
         return Contributions(tuple(together))
 
 
-def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
-    """Derivatives, by the unknowns, of what is expected near zero of both curves."""
+def _roughness_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
+    """Derivatives of the curves' prior residuals (roughness) by the unknowns."""
     curves = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
     first, second = (jax.tree.map(np.asarray, curve).terms().prior for curve in curves)
     slopes = np.zeros((len(first) + len(second), len(fit.covariance)))
@@ -125,21 +129,23 @@ def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
 
 @on_numbers("Differentiate `sj.identify.refit`.")
 def contributions(fit: JointFit) -> Contributions:
-    """What noise, every level's errors and every linear parameter add to the bands of both curves.
+    """Contributions of noise, level errors and linear parameters to the bands of both curves.
 
     To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
-    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error. Where the residuals of
-    neighbouring states are correlated, random errors count for as much more.
+    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y at fixed whitening. Random errors are enlarged where the residuals of
+    neighbouring states are correlated.
 
-    Returns shares of the variance between the smallest and the largest measured displacement,
-    largest first; they sum to one but for rounding.
+    Returns fractions of the variance, averaged from the smallest to the largest measured
+    displacement, largest first; they sum to one but for rounding.
     Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     n, n_levels = len(fit.data.level), fit.data.n_levels
     points, by_error = whitened_slopes(fit.packed(), padded_problem(fit.problem), n)
     p, n_linear = points.shape[2], len(fit.unknowns.linear)
     deviations = np.eye(p)[-n_linear - n_levels * len(LEVEL_ERRORS) :]
-    inverse = inverse_of(np.concatenate([points.reshape(-1, p), deviations, _bend_slopes(fit)]))
+    inverse = inverse_of(
+        np.concatenate([points.reshape(-1, p), deviations, _roughness_slopes(fit)])
+    )
     by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)
     measured = np.asarray(fit.motion().displacement)
     at = np.linspace(measured.min(), measured.max(), _AMPLITUDES)
@@ -163,11 +169,11 @@ def contributions(fit: JointFit) -> Contributions:
         column = inverse[:, p - n_linear + k]
         if linear_std[k] > 0:
             name, kind = f"linear parameter {k + 1}", "linear parameters"
-            if k >= n_linear - len(_OWN):
-                name = kind = _OWN[k - n_linear]
+            if k >= n_linear - len(_OTHER):
+                name = kind = _OTHER[k - n_linear]
             rows.append((name, kind, column[:, None]))
     name = "smoothness of the curves"
-    rows.append((name, name, inverse @ _bend_slopes(fit).T))
+    rows.append((name, name, inverse @ _roughness_slopes(fit).T))
     summed = [np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows]
     parts = np.stack(summed)
     fractions = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()

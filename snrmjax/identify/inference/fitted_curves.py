@@ -12,10 +12,10 @@ from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, banded_values
 from snrmjax.numerics.compiled import on_numbers
 
-_SCAN = 256  # displacements of the backbone, on which a velocity is looked for
+_SCAN = 256  # displacements at which the backbone is sampled to bracket a velocity
 _ITERATIONS = 12
-_KNOTS = 120  # of curves of families by name, for what takes a `Backbone`
-_DOUBLINGS = 6  # of the displacement, to reach a velocity
+_KNOTS = 120  # of a named family interpolated as a `Backbone`
+_DOUBLINGS = 6  # of the displacement range, to reach a velocity
 
 
 @on_numbers("Differentiate `sj.identify.refit`.")
@@ -29,9 +29,9 @@ def fitted_values(
     """ω̃ and ζ̃ at amplitudes on the backbone, with 1σ at that amplitude.
 
     Arguments: either `velocity` in m/s or `displacement` in m, zero allowed. With `of_a_new_level`
-    the bands are those of the next test: they include by how much one level differs from another.
-    Raises `ValueError` for a velocity that the backbone has at several displacements, as it can
-    have where it softens: give displacements there.
+    the bands are predictive: they include level-to-level variation.
+    Raises `ValueError` for a velocity that the backbone has at several displacements, possible
+    where it softens: give displacements there.
     Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     if (velocity is None) == (displacement is None):
@@ -52,11 +52,11 @@ def fitted_values(
 def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
     """`fitted_values` from rest to the largest measured amplitude.
 
-    In equal steps of velocity, or of displacement where the backbone turns back in velocity.
+    In equal steps of velocity, or of displacement where the velocity is not monotonic.
     """
     displacement, velocity = fit.largest
     steps = np.linspace(0.0, 1.0, n_points)
-    if _near(fit, velocity).turns_back_at is None:
+    if _backbone_to(fit, velocity).reverses_at is None:
         return fitted_values(fit, velocity * steps)
     return fitted_values(fit, displacement=displacement * steps)
 
@@ -64,12 +64,11 @@ def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
 def as_backbone(
     fit: JointFit, *, argument: Argument = "displacement", reach: float = 1.0
 ) -> Backbone:
-    """The fitted curves as what responses are predicted from.
+    """The fitted curves as a `Backbone`, for response prediction.
 
-    The smooth curves are the fit's own, at its own knots. Families by name are drawn through many
-    knots, up to `reach` times the largest measured displacement; damping that belongs to the
-    velocity is then taken where it lies on the backbone. Against velocity the knots are where the
-    backbone has them.
+    Smooth curves keep the fit's knots. Named families are interpolated at many knots, up to `reach`
+    times the largest measured displacement; damping as a function of velocity is evaluated on the
+    backbone. For `argument` "velocity" the knots are at the backbone's velocities.
     """
     are_own = argument == "displacement" and _are_smooth(fit)
     squared, damping, covariance = _own_curves(fit) if are_own else _redrawn(fit, argument, reach)
@@ -88,7 +87,7 @@ def as_backbone(
 
 
 def _are_smooth(fit: JointFit) -> bool:
-    """Whether both curves are smooth ones of the displacement, through the same knots."""
+    """Whether both curves are smoothing splines of displacement, which share their knots."""
     pair = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
     return all(
         isinstance(curve, SmoothingSpline) and curve.argument == "displacement" for curve in pair
@@ -111,13 +110,13 @@ def _redrawn(
         displacement = float(squared.scale) * np.sqrt(np.asarray(squared.knots))
     with np.errstate(invalid="ignore"):
         positive = values_at_displacement(fit, displacement).values[:, 0] > 0
-    # A polynomial may fall below zero beyond the data: there is no motion there.
+    # A polynomial ω̃² may become negative beyond the data: cut it there.
     displacement = displacement[: np.append(positive, False).argmin()]
     curves = values_at_displacement(fit, displacement)
     if argument == "velocity":
         curves = values_at_velocity(fit, curves.velocity)
     at, values = getattr(curves, argument), curves.values
-    # Dry friction has no finite damping at rest: there the next knot's value stands.
+    # Dry friction has infinite damping at rest: use the next knot's value.
     values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
     pair = (
         Spline.through((at / at[-1]) ** 2, values[:, k], jax.device_put(at[-1]), argument)
@@ -137,35 +136,35 @@ class OnBackbone(NamedTuple):
 
 
 def values_at_velocity(fit: JointFit, velocity: Float[np.ndarray, " point"]) -> OnBackbone:
-    """Both curves, with their derivatives by the free unknowns at those velocities.
+    """Both curves at these velocities, with derivatives by the free unknowns.
 
     Raises `ValueError` where the backbone has a velocity at several displacements, or at none.
     """
-    reached = _near(fit, float(np.max(velocity)))
-    if reached.turns_back_at is not None:
+    backbone = _backbone_to(fit, float(np.max(velocity)))
+    if backbone.reverses_at is not None:
         raise ValueError(
-            f"the backbone turns back at {reached.turns_back_at:.4g} m/s: there velocities belong "
-            "to several displacements; ask for values at displacements."
+            f"the backbone turns back at {backbone.reverses_at:.4g} m/s, so that a velocity has "
+            "several displacements: give displacements instead."
         )
-    if np.max(velocity) > reached.speed[-1]:
+    if np.max(velocity) > backbone.speed[-1]:
         raise ValueError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
-    near = np.interp(velocity, reached.speed, reached.displacement)
+    near = np.interp(velocity, backbone.speed, backbone.displacement)
     return _on_backbone(fit, velocity, near)
 
 
 def values_at_displacement(fit: JointFit, displacement: Float[np.ndarray, " point"]) -> OnBackbone:
-    """Both curves, with their derivatives by the free unknowns at those displacements."""
+    """Both curves at these displacements, with derivatives by the free unknowns."""
     return _on_backbone(fit, displacement, None)
 
 
 def _on_backbone(
     fit: JointFit, at: Float[np.ndarray, " point"], near: Float[np.ndarray, " point"] | None
 ) -> OnBackbone:
-    """ω̃² and 2ζ̃ω̃ and their derivatives, by the host.
+    """ω̃² and 2ζ̃ω̃ and their derivatives at fixed amplitude, on the host.
 
-    Arguments: `at` displacements, at which derivatives are taken, or, where displacements `near`
-    them are given, velocities. Where a curve is a function of the other amplitude this is the one
-    that belongs to it, and moves with the curves' parameters.
+    Arguments: `at` displacements or, with approximate displacements `near`, velocities. A curve of
+    the other amplitude is evaluated there by v = ω̃x, whose dependence on the curves' parameters is
+    included in the derivatives.
     """
     unknowns = fit.unknowns
     curves = unknowns.squared_frequency, unknowns.modal_damping
@@ -182,18 +181,18 @@ def _on_backbone(
     else:
         other = at * np.sqrt(curves[0].linearised(0 * at)[0]) if near is None else near
         for _ in range(_ITERATIONS + 1):
-            # v − x√s(x) for x, or x√s(v) − v for v.
+            # Newton: x√s(x) − v = 0 for x, or x√s(v) − v = 0 for v.
             squared, by_own, steep = curves[0].linearised(other)
             root = np.sqrt(squared)
-            gap = other * root - at if given_velocity else at * root - other
+            residual = other * root - at if given_velocity else at * root - other
             sensitivity = (other if given_velocity else at) / (2 * root)
             slope = (root if given_velocity else -1.0) + sensitivity * steep
             moves = -(sensitivity / slope)[:, None] * by_own
-            other = other - gap / slope
+            other = other - residual / slope
         by_own = by_own + steep[:, None] * moves
     displacement, velocity = (other, at) if given_velocity else (at, other)
     damping, by_damping, steep = curves[1].linearised(velocity if of_velocity[1] else displacement)
-    # The unknowns after those of the curves move nothing here.
+    # The other unknowns do not enter the curves.
     slopes = np.zeros((len(at), 2, len(fit.covariance)))
     slopes[:, 0, :n], slopes[:, 1, n : n + by_damping.shape[1]] = by_own, by_damping
     if of_velocity[1] != given_velocity:
@@ -201,23 +200,23 @@ def _on_backbone(
     return OnBackbone(np.stack([squared, damping], axis=1), slopes, displacement, velocity)
 
 
-class _Reached(NamedTuple):
+class _BackboneRange(NamedTuple):
     displacement: np.ndarray
     speed: np.ndarray
-    turns_back_at: float | None  # m/s, below the velocity that was asked for
+    reverses_at: float | None  # m/s, below the requested velocity
 
 
-def _near(fit: JointFit, velocity: float) -> _Reached:
-    """The backbone from rest to beyond the measured displacements and a velocity."""
+def _backbone_to(fit: JointFit, velocity: float) -> _BackboneRange:
+    """The backbone from rest to at least the measured displacements and this velocity."""
     reach = fit.largest[0]
     for _ in range(_DOUBLINGS):
         x = np.linspace(0.0, reach, _SCAN)
         speed = _on_backbone(fit, x, None).velocity
-        turns = np.flatnonzero(~(np.diff(speed) > 0))
-        if turns.size and np.min(speed[turns[0] :]) < velocity:
-            return _Reached(x, speed, float(speed[turns[0]]))
-        if turns.size or speed[-1] >= velocity:
+        reversals = np.flatnonzero(~(np.diff(speed) > 0))
+        if reversals.size and np.min(speed[reversals[0] :]) < velocity:
+            return _BackboneRange(x, speed, float(speed[reversals[0]]))
+        if reversals.size or speed[-1] >= velocity:
             break
         reach *= 2
-    end = turns[0] + 1 if turns.size else len(x)
-    return _Reached(x[:end], speed[:end], None)
+    end = reversals[0] + 1 if reversals.size else len(x)
+    return _BackboneRange(x[:end], speed[:end], None)

@@ -1,4 +1,4 @@
-"""Responses of fitted curves under a force, with their resonances and folds, all with bands."""
+"""Forced responses of a joint fit, with their resonances and folds, all with bands."""
 
 from typing import Any
 
@@ -8,10 +8,10 @@ from jaxtyping import Float
 from snrmjax.identify.inference.fitted_curves import as_backbone, values_at_displacement
 from snrmjax.identify.inference.forced_motion import (
     FittedPoint,
-    Place,
+    InitialPoint,
     banded_curve,
     located,
-    turns,
+    turning_points,
 )
 from snrmjax.identify.joint.force_balance import with_deviations
 from snrmjax.identify.joint.joint_fit import JointFit
@@ -38,10 +38,10 @@ from snrmjax.numerics.units import HERTZ
 
 
 class FittedResponse(PredictedResponse):
-    """A response curve along rising and falling amplitude, with 1σ.
+    """A response curve, in order along the branch, with 1σ.
 
-    `resonances` and `folds` are those that were located; `not_located` are the others, at the
-    place where the drawn curve has them, without a band.
+    `resonances` and `folds` are those located by Newton's method; `not_located` are the others, at
+    their approximate location on the interpolated curve, without a band.
     """
 
     frequency_std: Float[np.ndarray, " point"] = quantity("point", "Hz", "1σ at fixed amplitude")
@@ -54,10 +54,10 @@ class FittedResponse(PredictedResponse):
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
-        hertz, size = self.frequency / HERTZ, np.abs(self.velocity)
+        hertz, speed = self.frequency / HERTZ, np.abs(self.velocity)
         return (
             f"FittedResponse to {self.force:.4g} N: {len(hertz)} points from {hertz.min():.6g} to "
-            f"{hertz.max():.6g} Hz, up to {size.max():.4g} m/s",
+            f"{hertz.max():.6g} Hz, up to {speed.max():.4g} m/s",
             *(
                 f"{point.kind} at {point.frequency / HERTZ:.6g} ± "
                 f"{point.frequency_std / HERTZ:.2g} Hz, {point.velocity:.4g} ± "
@@ -71,11 +71,11 @@ class FittedResponse(PredictedResponse):
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        more: dict[str, str | float | int] = {
+        extra: dict[str, str | float | int] = {
             "sensor": self.sensor,
             "n_not_located": len(self.not_located),
         }
-        return super().attributes() | more
+        return super().attributes() | extra
 
 
 @on_numbers("Differentiate `sj.identify.refit`.")
@@ -88,45 +88,47 @@ def fitted_response(
     largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
     of: NewLevel | None = None,
 ) -> list[FittedResponse]:
-    """Response curves under a force with bands, and its resonances and folds with theirs.
+    """Response curves under a force, with their resonances and folds, all with bands.
 
-    Bands come from the implicit function theorem on the curve's own equation
-    |(ω̃² − Ω²) + iΩδ| X = |A|F: at fixed amplitude for the frequency, at fixed frequency for the
-    velocity, along both equations of a resonance and of a fold. They are those of a further
-    level: they also hold by how much one level differs from another.
+    Bands come from the implicit function theorem on |(ω̃² − Ω²) + iΩδ| X = |A|F: at fixed amplitude
+    for the frequency, at fixed frequency for the velocity, and on both equations of a resonance or
+    a fold. They are predictive for a new level: they include level-to-level variation.
 
     Arguments: `force` in N, frequencies in rad/s; curves end at `largest_amplitude_ratio` times
-    the largest measured amplitude, beyond which the fitted curves are extrapolated; `of` the level
-    that is predicted where it is not `new_level`'s (`ON_THE_CURVES`: the mode itself).
-    Returns the connected curves, the main one first; resonances and folds with the first curve
-    that has them; the `note` of each says where it extrapolates.
+    the largest measured amplitude, extrapolated beyond the data; `of` the predicted level, by
+    default `new_level`'s (`ON_THE_CURVES`: the fitted mode itself).
+    Returns the connected curves, the main one first; resonances and folds are listed with the first
+    curve that has them; `note` reports extrapolation.
     Raises `ValueError` for a force or a ratio that is not positive.
     Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     ratio = {"largest_amplitude_ratio": largest_amplitude_ratio}
     level = new_level(fit, force) if of is None else of
     modes = level.modes(fit)
-    rough = as_backbone(fit, reach=largest_amplitude_ratio).moved_by(level.over_test(fit))
+    interpolated = as_backbone(fit, reach=largest_amplitude_ratio).moved_by(level.over_test(fit))
     curves = predict_response(
-        *(rough, modes, force),
+        *(interpolated, modes, force),
         from_frequency=from_frequency,
         to_frequency=to_frequency,
         largest_amplitude_ratio=largest_amplitude_ratio,
     )
-    tips = [
-        Place("resonance", r.amplitude, r.frequency)
-        for r in resonances(rough, modes, force, **ratio)
+    peaks = [
+        InitialPoint("resonance", r.amplitude, r.frequency)
+        for r in resonances(interpolated, modes, force, **ratio)
         if from_frequency <= r.frequency <= to_frequency
     ]
-    answer = []
+    responses = []
     for number, curve in enumerate(curves):
         band = banded_curve(fit, force, curve.amplitude, curve.frequency, level)
         amplitude, frequency, velocity, frequency_std, velocity_std = band
-        places = [*(tips if number == 0 else ()), *turns(curve.frequency, curve.amplitude)]
-        points = [located(fit, force, place, level) for place in places]
-        good = [point for point in points if point.located]
+        starts = [
+            *(peaks if number == 0 else ()),
+            *turning_points(curve.frequency, curve.amplitude),
+        ]
+        points = [located(fit, force, start, level) for start in starts]
+        located_points = [point for point in points if point.located]
         missing = tuple(point for point in points if not point.located)
-        answer.append(
+        responses.append(
             FittedResponse(
                 force=force,
                 frequency=frequency,
@@ -139,13 +141,13 @@ def fitted_response(
                 notes=(*curve.notes, *_notes_on(missing, force)),
                 frequency_std=frequency_std,
                 velocity_std=velocity_std,
-                resonances=tuple(point for point in good if point.kind == "resonance"),
-                folds=tuple(point for point in good if point.kind == "fold"),
+                resonances=tuple(point for point in located_points if point.kind == "resonance"),
+                folds=tuple(point for point in located_points if point.kind == "fold"),
                 not_located=missing,
                 sensor=fit.modes.sensors[fit.data.sensor],
             )
         )
-    return answer
+    return responses
 
 
 def _notes_on(missing: tuple[FittedPoint, ...], force: float) -> tuple[Fact, ...]:
@@ -162,13 +164,13 @@ def predicted_resonance(
     of: NewLevel | None = None,
     self_excited: bool = False,
 ) -> ResonanceDistribution:
-    """Whether a further level has its resonance within a range of amplitudes, and where.
+    """Probability and distribution of a new level's resonance within an amplitude range.
 
-    Curves are drawn from the fit with a further level's errors (`new_level`). Beyond the data the
-    bands widen with what they leave open.
+    Curves are sampled from the fit's posterior with the errors of a new level (`new_level`). Beyond
+    the data the bands widen as the curves are extrapolated.
 
-    Arguments: `force` in N, looked for up to `largest_amplitude_ratio` times the largest measured
-    amplitude; `of` the level where it is not `new_level`'s; `self_excited` allows negative damping.
+    Arguments: `force` in N; the range ends at `largest_amplitude_ratio` times the largest measured
+    amplitude; `of` the level, by default `new_level`'s; `self_excited` allows negative damping.
     Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     new = new_level(fit, force) if of is None else of

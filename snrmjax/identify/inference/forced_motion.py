@@ -1,5 +1,5 @@
-"""The fitted mode under one force: response curve, resonances and folds with bands, by implicit
-derivatives.
+"""Forced response of the fitted mode: curve, resonances and folds with bands, by implicit
+differentiation.
 """
 
 from typing import Literal, NamedTuple
@@ -23,31 +23,31 @@ from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import quantity, setting
 
-_BLOCK = 256  # points that one program works on
-_ONTO_THE_CURVE = 4  # steps
+_BLOCK = 256  # points per compiled call
+_ONTO_THE_CURVE = 4  # Newton steps
 
 
 class ForcedMotion(eqx.Module):
-    """A fit's curves under one force; amplitude X and frequency Ω are free.
+    """Response equation of a fit under one force, in amplitude X and frequency Ω.
 
-    The response curve is where |(ω̃² − Ω²) + iΩδ| X = |A|F. The unknowns are the fit's, then the
-    errors (`LEVEL_ERRORS`) of the level that is predicted: zero, with `level_std` as their 1σ.
+    The response curve satisfies |(ω̃² − Ω²) + iΩδ| X = |A|F. The unknowns are the fit's, then the
+    level errors (`LEVEL_ERRORS`) of the predicted level: zero, with `level_std` as their 1σ.
     """
 
     unravel: Unravel
     modes: LinearModes
     linear_std: Float[Array, " deviation"]
     constant: Float[Array, ""]  # A, 1/kg, with the model's modal mass
-    force: Float[Array, ""]  # N, or what the test records of it
-    recorded: Float[Array, ""]  # 1 where it is a record, whose gain may err; else 0
-    smallest: Float[Array, ""]  # record, that an offset is relative to
+    force: Float[Array, ""]  # N, or its record
+    recorded: Float[Array, ""]  # 1 where `force` is a record, which has a gain error; else 0
+    smallest: Float[Array, ""]  # smallest recorded force, unit of the offset
     gain_of_force: Float[Array, ""]  # see `PriorStd`
     level_std: Float[Array, " error"]
     sensor: int = eqx.field(static=True)
 
     @classmethod
     def of(cls, fit: JointFit, force: float, new: NewLevel = ON_THE_CURVES) -> "ForcedMotion":
-        """A fit under a force in N, or under the record that `new` gives."""
+        """A fit under a force in N, or under the record of `new`."""
         return cls(
             unravel=fit.packed().unravel,
             modes=new.modes(fit),
@@ -72,8 +72,8 @@ class ForcedMotion(eqx.Module):
     def excess(self, vector: Array, x: Array, omega: Array) -> Float[Array, "*batch"]:
         """|(ω̃² − Ω²) + iΩδ|² X²/load² − 1."""
         squared, damping = self.curves(vector, x, omega)
-        size = (squared - omega**2) ** 2 + (omega * damping) ** 2
-        return size * (x / self.load_of(vector, omega)) ** 2 - 1.0
+        square = (squared - omega**2) ** 2 + (omega * damping) ** 2
+        return square * (x / self.load_of(vector, omega)) ** 2 - 1.0
 
     def load_of(self, vector: Array, omega: Array) -> Float[Array, "*batch"]:
         """|A|F in m/s² at a frequency, with the fit's modal mass."""
@@ -88,7 +88,7 @@ class ForcedMotion(eqx.Module):
         return jnp.where(self.recorded > 0, true, self.force)
 
     def curves(self, vector: Array, x: Array, omega: Array) -> tuple[Array, Array]:
-        """ω̃² and 2ζ̃ω̃ of the level's motion of displacement x at a frequency."""
+        """The level's ω̃² and 2ζ̃ω̃ at displacement x and a frequency."""
         unknowns, level = self.split(vector)
         squared, damping = unknowns.squared_frequency, unknowns.modal_damping
         speed = x * omega
@@ -102,7 +102,7 @@ class ForcedMotion(eqx.Module):
         return self.constant * jnp.exp(-log_modal_mass(unknowns, self.linear_std))
 
     def velocity(self, vector: Array, x: Array, omega: Array) -> Complex[Array, "*batch"]:
-        """Velocity at the fit's sensor as the level records it, residual modes included."""
+        """Velocity at the fit's sensor as recorded in the level, residual modes included."""
         (unknowns, level), force = self.split(vector), self.force_of(vector)
         squared, damping = self.curves(vector, x, omega)
         constant = self._constant_of(unknowns)
@@ -118,7 +118,7 @@ class ForcedMotion(eqx.Module):
 def banded_curve(
     fit: JointFit, force: float, amplitude: np.ndarray, frequency: np.ndarray, new: NewLevel
 ) -> tuple[np.ndarray, ...]:
-    """The points of a response curve that are nearest to some, with bands.
+    """Points of a response curve, corrected onto the fit's own curve, with bands.
 
     Returns displacement (m), frequency (rad/s) and velocity (m/s) of every point, 1σ of the
     frequency at fixed amplitude and of the velocity's magnitude at fixed frequency.
@@ -127,7 +127,7 @@ def banded_curve(
     of_fit, level = program.padded_covariance(fit.covariance), np.diag(new.std**2)
     covariance = jnp.asarray(block_diag(of_fit, level))
     count, vector = np.array(_ONTO_THE_CURVE), motion.with_level(program.vector)
-    # The points come from curves drawn anew through knots: steps put them on the fit's own.
+    # The points come from interpolated curves: Newton steps move them onto the fit's own.
     return by_blocks(
         lambda x, omega: _bands(motion, vector, covariance, x, omega, count),
         *(_BLOCK, np.asarray(amplitude), np.asarray(frequency)),
@@ -138,7 +138,7 @@ def banded_curve(
 def _bands(
     motion: ForcedMotion, vector: Array, covariance: Array, x: Array, omega: Array, steps: Array
 ) -> tuple[Array, ...]:
-    """What `banded_curve` returns, after so many steps onto the curve."""
+    """The values of `banded_curve`, after this many minimum-norm Newton steps onto the curve."""
     ones, excess = jnp.ones_like(x), motion.excess
 
     def by(position: int, x: Array, omega: Array) -> Array:
@@ -169,8 +169,8 @@ def _bands(
 
 
 _ITERATIONS = 12
-_SETTLED = 1e-9  # relative step, below which a point is a root
-_FARTHEST = 0.2  # relative, from where the drawn curve has it
+_SETTLED = 1e-9  # relative Newton step at convergence
+_FARTHEST = 0.2  # relative, from the initial point
 
 Kind = Literal["resonance", "fold"]
 
@@ -178,21 +178,21 @@ Kind = Literal["resonance", "fold"]
 class FittedPoint(Resonance):
     """A resonance or a fold of a fitted response, with 1σ; a fold has no damping ratio (NaN).
 
-    One that was not located has the place that the drawn curve has, and NaN for 1σ.
+    One that was not located has its approximate location on the interpolated curve, and NaN for 1σ.
     """
 
     frequency_std: float = quantity("", "Hz", "1σ of the frequency")
     velocity_std: float = quantity("", "m/s", "1σ of the velocity")
     kind: Kind = setting()
-    located: bool  # False: no root of Newton's method near where the drawn curve has it
+    located: bool  # False: Newton's method found no root near the initial point
 
     def attributes(self) -> dict[str, str | float | int]:
-        """What it is, and whether it was located."""
+        """Kind and status."""
         return {"kind": self.kind, "status": "located" if self.located else "not_located"}
 
 
-class Place(NamedTuple):
-    """Where a resonance or a fold is looked for."""
+class InitialPoint(NamedTuple):
+    """Initial point of Newton's method for a resonance or a fold."""
 
     kind: Kind
     amplitude: float  # m
@@ -200,32 +200,32 @@ class Place(NamedTuple):
 
 
 class SolvedPoint(NamedTuple):
-    """A root of the equations of a resonance or fold, and its derivatives."""
+    """A resonance or fold solved for, with its derivatives."""
 
     values: np.ndarray  # frequency, velocity, displacement
-    slopes: np.ndarray  # of them by the fit's unknowns
-    by_level: np.ndarray  # and by the level's errors
+    slopes: np.ndarray  # by the fit's unknowns
+    by_level: np.ndarray  # by the level's errors
 
     def variance(self, fit: JointFit) -> np.ndarray:
-        """That of the fit's unknowns."""
+        """Variance due to the fit's unknowns."""
         return np.einsum("op,pq,oq->o", self.slopes, fit.covariance, self.slopes)
 
 
 def located(
-    fit: JointFit, force: float, place: Place, new: NewLevel = ON_THE_CURVES
+    fit: JointFit, force: float, start: InitialPoint, new: NewLevel = ON_THE_CURVES
 ) -> FittedPoint:
-    """The resonance or fold near a place.
+    """The resonance or fold near an initial point.
 
-    At a phase resonance the mode moves in phase with the force: 2ζ̃ω̃ = |A|F/v.
+    At phase resonance the velocity is in phase with the force: 2ζ̃ω̃ = |A|F/v.
     """
-    solved = solved_point(fit, force, place, new)
-    (_, x, omega), nan = place, float("nan")
+    solved = solved_point(fit, force, start, new)
+    (_, x, omega), nan = start, float("nan")
     values, std, ratio = np.array([omega, omega * x, x]), np.full(3, nan), nan
     if solved is not None:
         values = solved.values
         std = np.sqrt(solved.variance(fit) + solved.by_level**2 @ new.std**2)
     omega, speed, x = map(float, values)
-    if solved is not None and place.kind == "resonance":
+    if solved is not None and start.kind == "resonance":
         constant = float(fit.problem.constant_of(fit.unknowns)) * new.over_test(fit)
         load = abs(constant) * force * float(sensed_mode(new.modes(fit), omega).ratio)
         ratio = load / (2 * omega**2 * x)
@@ -238,27 +238,27 @@ def located(
         continued=x > fit.largest[0] * (1 + 1e-9),
         frequency_std=float(std[0]),
         velocity_std=float(std[1]),
-        kind=place.kind,
+        kind=start.kind,
         located=solved is not None,
     )
 
 
-def turns(frequency: np.ndarray, amplitude: np.ndarray) -> list[Place]:
-    """Where a curve turns back in frequency."""
+def turning_points(frequency: np.ndarray, amplitude: np.ndarray) -> list[InitialPoint]:
+    """Folds of a curve: where its frequency reverses."""
     steps = np.sign(np.diff(frequency))
     at = np.flatnonzero(steps[:-1] * steps[1:] < 0) + 1
-    return [Place("fold", float(amplitude[k]), float(frequency[k])) for k in at]
+    return [InitialPoint("fold", float(amplitude[k]), float(frequency[k])) for k in at]
 
 
 def solved_point(
-    fit: JointFit, force: float, place: Place, new: NewLevel = ON_THE_CURVES
+    fit: JointFit, force: float, start: InitialPoint, new: NewLevel = ON_THE_CURVES
 ) -> SolvedPoint | None:
-    """Frequency, velocity and displacement of a point, and their slopes by the unknowns."""
+    """Frequency, velocity and displacement of a point, and their derivatives by the unknowns."""
     program, motion = fit.packed(), ForcedMotion.of(fit, force, new)
-    unit = jnp.array([place.amplitude, place.frequency])
-    vector, is_fold = motion.with_level(program.vector), np.array(place.kind == "fold")
-    values, slopes, good = map(np.asarray, _point_with_slopes(motion, vector, unit, is_fold))
-    if not good:
+    unit = jnp.array([start.amplitude, start.frequency])
+    vector, is_fold = motion.with_level(program.vector), np.array(start.kind == "fold")
+    values, slopes, converged = map(np.asarray, _point_with_slopes(motion, vector, unit, is_fold))
+    if not converged:
         return None
     return SolvedPoint(values, slopes[:, program.own], slopes[:, len(program.vector) :])
 
@@ -273,7 +273,7 @@ def _point_with_slopes(
             lambda x: motion.excess(vector, x, omega), (x,), (jnp.ones_like(x),)
         )
         squared, damping = motion.curves(vector, x, omega)
-        # Where the level's record is in phase, the motion itself lags by the error of its phase.
+        # Where the record is in phase with the force, the motion lags by the phase error.
         phase = motion.split(vector)[1][1]
         resonance = [
             squared / omega**2 - 1 + damping / omega * jnp.tan(phase),
@@ -286,10 +286,10 @@ def _point_with_slopes(
         return point - jnp.linalg.solve(jacobian, equations(point, vector))
 
     point = jax.lax.fori_loop(0, _ITERATIONS, step, jnp.ones(2))
-    # What a further step would move: what the equations leave grows with lightly damped slopes.
+    # Convergence by the next Newton step: residuals scale with the steep slopes of light damping.
     jacobian, by_vector = jax.jacfwd(equations, argnums=(0, 1))(point, vector)
-    left = jnp.linalg.solve(jacobian, equations(point, vector))
-    good = jnp.all(jnp.abs(left) < _SETTLED) & jnp.all(jnp.abs(point - 1.0) < _FARTHEST)
+    newton_step = jnp.linalg.solve(jacobian, equations(point, vector))
+    converged = jnp.all(jnp.abs(newton_step) < _SETTLED) & jnp.all(jnp.abs(point - 1.0) < _FARTHEST)
     along = -jnp.linalg.solve(jacobian, by_vector)
 
     def outputs(point: Array, vector: Array) -> Array:
@@ -297,4 +297,4 @@ def _point_with_slopes(
         return jnp.stack([omega, jnp.abs(motion.velocity(vector, x, omega)), x])
 
     by_point, direct = jax.jacfwd(outputs, argnums=(0, 1))(point, vector)
-    return outputs(point, vector), by_point @ along + direct, good
+    return outputs(point, vector), by_point @ along + direct, converged

@@ -1,4 +1,4 @@
-"""The whole inverse method in one call: steady states in, backbone and damping out."""
+"""The inverse method in one call: backbone and damping from steady states."""
 
 import dataclasses
 from typing import ClassVar
@@ -31,13 +31,16 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.units import HERTZ
 
-_FEWEST = 2  # points, of which a curve can be told
-_SHAPE_MISSED = 0.1  # share of a motion that is not the mode's shape and worth a note
-_EXPLAINED, _WORTH = 0.3, 0.1  # by the phase: share of the damping's variance, and its change
+_FEWEST = 2  # points for a curve
+_SHAPE_MISSED = 0.1  # fraction of the motion outside the mode shape, worth a note
+_EXPLAINED, _RELEVANT = (
+    0.3,
+    0.1,
+)  # by the phase: fraction of the damping's variance; relative change
 
 
 class Identification(AbstractResult):
-    """Points, curves and everything that a reader of them should know.
+    """Identified points, backbone and damping curves, and notes on their validity.
 
     The curves are those of `fit`, the joint fit of all states.
     """
@@ -51,19 +54,19 @@ class Identification(AbstractResult):
 
     @property
     def level_frequency_std(self) -> float:
-        """1σ of the natural frequency (rad/s) that the states of a level share."""
+        """Level-to-level 1σ of the natural frequency, rad/s."""
         j = self.fit.modes.mode_of_interest
         natural = self.fit.modes.natural_frequency.item(j)
         return 0.5 * float(self.fit.noise.level_std[2]) * natural
 
     @property
     def level_damping_std(self) -> float:
-        """The same of the damping ratio."""
+        """Level-to-level 1σ of the damping ratio."""
         j = self.fit.modes.mode_of_interest
         return float(self.fit.noise.level_std[3]) * self.fit.modes.damping_ratio.item(j)
 
     def summary(self) -> tuple[str, ...]:
-        """How many points, ranges of the curves, what states and levels scatter by, notes."""
+        """Numbers of points, ranges of the curves, scatter of states and levels, notes."""
         points, ends = self.points, self.backbone.sampled()
         n_levels, noise = len(np.unique(np.asarray(points.level))), self.fit.noise
         scale = f"{noise.scale:.3g} times the stated noise"
@@ -119,16 +122,15 @@ def identify_backbone(
 ) -> Identification:
     """Backbone and damping of the mode of interest from near-resonant steady states.
 
-    Each state has its own point (`identify_points`); the curves and their bands are those of the
-    model of a test, the smooth curves of `fit_jointly`. `modes` may also be the structure that has
-    them: the errors of levels that it states then enter the bands. Where no noise is stated, the
-    standard deviations of the points come from the scatter about the curves.
+    Each state gives a point (`identify_points`); the curves and their bands are the smooth ones of
+    `fit_jointly`. `modes` may also be a structure: its stated level errors then enter the bands.
+    Where no noise is stated, the standard deviations of the points come from the scatter about the
+    curves.
 
     Arguments: `amplitude` and `measure` as in `identify_points`; `n_knots` at most of each curve.
-    Returns an `Identification` whose `notes` say what the reader of the file did not use, what was
-    left out and what the noise turned out to be.
+    Returns an `Identification` whose `notes` report unused input, states left out, and the noise.
     Raises `ValueError` where fewer than two states have a point, and what `fit_jointly` raises.
-    Not differentiable, since curves are chosen: differentiate `identify_points`.
+    Not differentiable, since curves are selected: differentiate `identify_points`.
     Reference: Kwarta & Allen, section 2.2.
     """
     points = identify_points(data, modes_of(modes), amplitude=amplitude, measure=measure)
@@ -159,11 +161,10 @@ def identification_of_fit(
     amplitude: Argument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
 ) -> Identification:
-    """Each steady state's own point beside the curves of a joint fit.
+    """The points of all steady states, together with the curves of a joint fit.
 
-    Points come from the inverse method, with the modal mass that the fit found. Where no noise is
-    stated their 1σ is what the fit found: its noise, and errors of gain, phase, natural frequency
-    and damping that the states of a level share.
+    Points come from the inverse method with the fitted modal mass. Where no noise is stated, their
+    1σ comes from the fit's noise and level errors of gain, phase, natural frequency and damping.
 
     Arguments: `data` are the steady states of the fit, with forces in newtons; the others as in
     `identify_backbone`.
@@ -204,14 +205,13 @@ def errors_from_scatter(
     damping_std: float = 0.0,
     modal_mass_std: float | Float[Array, ""] | None = None,
 ) -> BackbonePoints:
-    """Points whose standard deviations come from the scatter, shared by level or not.
+    """Points with standard deviations from the scatter about the curves.
 
-    Arguments: `noise` of force, amplitude and phase each at resonance, relative, as a joint fit
-    finds it where none is stated (`balance_data`); `level_gain` (relative) and
-    `level_phase` (rad), where known, are 1σ of the errors of velocity and phase that all states of
-    a level share; `frequency_std` (rad/s) and `damping_std` what the natural frequency and the
-    damping ratio differ by from state to state; `modal_mass_std` (relative) is 1σ of the modal
-    mass, an error that all points share.
+    Arguments: `noise` at resonance, relative, of each of force, amplitude and phase, as estimated
+    by a joint fit (`balance_data`); `level_gain` (relative) and `level_phase` (rad) 1σ of the
+    errors that all states of a level share; `frequency_std` (rad/s) and `damping_std` 1σ of the
+    natural frequency and the damping ratio from state to state; `modal_mass_std` (relative) 1σ of
+    the modal mass, common to all points.
     """
     sensitivity = np.asarray(points.sensitivity)
     scale = noise * off_resonance_error_factor(np.asarray(points.mode_velocity))
@@ -234,7 +234,7 @@ def errors_from_scatter(
 
 
 def notes_on_points(points: BackbonePoints, modes: LinearModes) -> list[Fact]:
-    """Which states have no point, or two, and how far sensors are from the mode's shape."""
+    """States without a point or with two, and motion outside the mode shape."""
     status, notes = np.asarray(points.status), []
     for kind in PointStatus:
         count = int(np.sum(status == kind))
@@ -254,7 +254,7 @@ def notes_on_points(points: BackbonePoints, modes: LinearModes) -> list[Fact]:
 def notes_on_phases(
     points: BackbonePoints, curves: Backbone, *, phase_was_free: bool
 ) -> list[Fact]:
-    """That damping changes with the phase inside the levels, which it should not."""
+    """Whether damping correlates with phase within levels, which indicates a phase error."""
     points = jax.tree.map(np.asarray, points)
     use = points.usable
     level = points.level[use]
@@ -272,6 +272,6 @@ def notes_on_phases(
     slope = float(x @ y / (x @ x))
     explained = slope**2 * float(x @ x) / float(y @ y)
     across = slope * 2 * np.sin(np.pi / 4)  # from 45° on one side to 45° on the other
-    if explained < _EXPLAINED or abs(across) < _WORTH:
+    if explained < _EXPLAINED or abs(across) < _RELEVANT:
         return []
     return [Fact("damping_changes_with_phase", change=across, phase_was_free=phase_was_free)]

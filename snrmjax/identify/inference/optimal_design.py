@@ -1,4 +1,4 @@
-"""Which steady state to measure next: the one that makes a band narrowest."""
+"""Optimal design: the steady states that narrow a band most."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -37,16 +37,16 @@ Target = Literal["curves", "frequency", "damping"]
 _CURVES = ("natural frequency", "damping")
 _SHOWN = 12  # advised states on one screen
 _PER_FORCE = 96  # candidate states of one force
-_TARGETS = 25  # amplitudes at which the band of a curve counts
-_FROM_FOLD = 0.002  # relative frequency by which a state must keep away from a fold
-_FARTHEST = np.radians(70.0)  # from resonance: beyond it other errors rule
+_TARGETS = 25  # amplitudes at which a band is evaluated
+_FROM_FOLD = 0.002  # smallest relative frequency distance of a state from a fold
+_FARTHEST = np.radians(70.0)  # from resonance: beyond it other errors dominate
 
 
 class AdviceStatus(Status):
-    """How the search for the next measurements ended."""
+    """Outcome of the search for the next measurements."""
 
-    COMPLETE = 0, "as many states as were asked for"
-    FEWER_STATES = 1, "fewer candidate states than were asked for"
+    COMPLETE = 0, "as many states as requested"
+    FEWER_STATES = 1, "fewer candidate states than requested"
     NO_STATE = (
         2,
         "no stable state of the fitted responses within 70° of resonance can be measured in this "
@@ -58,11 +58,11 @@ class NextMeasurement(NamedTuple):
     """One advised steady state."""
 
     rank: int
-    force: float  # N; by the gain that the fit found where only the drive is known
+    force: float  # N; by the fitted gain where only the drive is known
     frequency: float  # rad/s
     velocity: float  # m/s, expected
     phase: float  # rad, expected of the velocity relative to the force
-    expected_band_ratio: float  # mean band after this and the ones before it, over today's
+    expected_band_ratio: float  # mean band after this and the preceding states, over the present
     reason: Fact
     drive: float | None = None  # V, where only the drive is known
 
@@ -87,7 +87,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         "phase_deg": (lambda row: np.degrees(row.phase), "deg", "phase"),
         "expected_band_ratio": (
             lambda row: row.expected_band_ratio,
-            *("1", "mean band after it, over today's"),
+            *("1", "mean band after it, over the present one"),
         ),
         "reason": (lambda row: str(row.reason), "", "why this state"),
     }
@@ -104,8 +104,8 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
         for row in self.rows[:_SHOWN]:
             load = f"force {row.force:.4g} N" if row.drive is None else f"drive {row.drive:.4g} V"
-            place = f"{load}, {row.frequency / HERTZ:.6g} Hz (expected {row.expected})"
-            lines.append(f"{row.rank}: {place}: {row.reason}")
+            state = f"{load}, {row.frequency / HERTZ:.6g} Hz (expected {row.expected})"
+            lines.append(f"{row.rank}: {state}: {row.reason}")
         if len(self) > _SHOWN:
             lines.append(f"and {len(self) - _SHOWN} more")
         if self.status != AdviceStatus.COMPLETE:
@@ -113,7 +113,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """Those of the rows, the force as a test states it."""
+        """Those of the rows, with either the force or the drive."""
         left_out = "force_n" if self.drive_known_only else "drive_v"
         return {
             name: variable for name, variable in super().variables().items() if name != left_out
@@ -134,25 +134,23 @@ def next_measurements(
     from_frequency: float = 0.0,
     to_frequency: float = np.inf,
 ) -> NextMeasurements:
-    """Rank steady states by how much they would narrow a band, each given the ones before it.
+    """Rank steady states by how much they narrow a band, each given the preceding ones.
 
-    Candidates are the stable states of the fitted responses within 70° of resonance; left out are
-    isolated branches, which no sweep reaches, states within 0.2 % of a fold, where a test jumps
-    off, and amplitudes that the fit has not seen. Every force counts as a level with its own
-    errors. The expected information comes from the fit's balance, linearised at the state, with the
-    sizes of noise and of levels' errors that the fit has: where nobody stated what levels differ
-    by, a further level tells that too, and the band gets narrower than expected. Bands are those
-    of the families taken, without what the choice among families leaves open.
+    Candidates are the stable states of the fitted responses within 70° of resonance, except
+    isolated branches, which no sweep reaches, states within 0.2 % of a fold, where a test jumps,
+    and extrapolated amplitudes. Every force is a new level with its own errors. The expected
+    information comes from the force balance linearised at the state, with the fit's noise and
+    level-error 1σ; where the latter is estimated, a new level improves it too, and the band narrows
+    more than expected. Bands are conditional on the chosen families.
 
     Arguments: `target` is the band to narrow: of both curves (relative), of natural frequency or
-    damping alone.
-    `forces`, by default twelve from the smallest to the largest measured. Both are in N, or in V
-    where the fitted data know the drive only. Frequencies in rad/s.
-    Returns at most `count` states: fewer, or none, when a test can reach no more; `status` says so,
-    and `notes` say that the fit has not converged.
+    damping alone; `forces` in N, or in V where only the drive is known, by default twelve from the
+    smallest to the largest measured; frequencies in rad/s.
+    Returns at most `count` states, fewer or none where no more can be measured (`status`); `notes`
+    report a fit that has not converged.
     Not differentiable: differentiate `snrmjax.identify.refit`.
-    Reference: the one-step rule of sequential design, Fedorov, Theory of Optimal Experiments
-    (1972), for a mean of standard deviations.
+    Reference: greedy sequential design, Fedorov, Theory of Optimal Experiments (1972), here for a
+    mean of standard deviations.
     """
     measured = np.asarray(fit.motion().force)
     wanted = np.geomspace(measured.min(), measured.max(), 12)
@@ -182,7 +180,7 @@ def _ranked(
     target: Target,
     count: int,
 ) -> list[NextMeasurement]:
-    """The best states one after the other; `slopes` of what shall become better known."""
+    """The best states by greedy selection; `slopes` of the target quantities."""
     rows = _information(fit, states)
     p, n_levels = fit.covariance.shape[0], rows.shape[2] - fit.covariance.shape[0]
     covariance = np.zeros((p + n_levels, p + n_levels))
@@ -224,7 +222,7 @@ class _States(NamedTuple):
     force: np.ndarray
     frequency: np.ndarray
     velocity: Complex[np.ndarray, " state"]
-    curves: tuple[FittedResponse, ...]  # that they are of
+    curves: tuple[FittedResponse, ...]  # that the states lie on
 
 
 def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -> _States | None:
@@ -250,7 +248,7 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
 
 
 def _measurable(fit: JointFit, curve: FittedResponse) -> np.ndarray:
-    # The phase counts from that in which the mode is driven.
+    # Phase of the velocity relative to the modal force.
     sensor, sign = fit.data.sensor, np.sign(float(fit.problem.modal_constant))
     to_mode = np.asarray(sensed_mode(fit.modes, curve.frequency).to_mode(sensor))
     phase = np.angle(sign * curve.velocity * to_mode)
@@ -263,7 +261,7 @@ def _measurable(fit: JointFit, curve: FittedResponse) -> np.ndarray:
 def _target(
     fit: JointFit, target: Target
 ) -> tuple[Float[np.ndarray, "output unknown"], Float[np.ndarray, " output"]]:
-    """Slopes of what shall become better known, and the values that its bands are relative to."""
+    """Slopes of the target quantities, and the values that their bands are relative to."""
     measured = np.asarray(fit.motion().displacement)
     at = np.linspace(measured.min(), measured.max(), _TARGETS)
     values, slopes, *_ = values_at_displacement(fit, at)
@@ -292,7 +290,7 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         std=jnp.broadcast_to(jnp.asarray(std), (n, len(std))),
         weight=jnp.ones(n),
         correction=jax.device_put(no_errors(n)),
-        away=jax.device_put(off_resonance(z, states.frequency)),
+        detuning=jax.device_put(off_resonance(z, states.frequency)),
         n_levels=n_levels,
         sensor=fit.data.sensor,
     )
@@ -301,7 +299,7 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
     levels = dataclasses.replace(padded_states, n_levels=room)
     of_new = dataclasses.replace(fit.prior, level=fit.prior.new_level)
     problem = BalanceProblem(levels, fit.modes, of_new)
-    # New levels in place of the fit's, which have no part in them.
+    # New levels replace the fit's, which are independent of them.
     new = np.zeros((n_levels, len(LEVEL_ERRORS)))
     unknowns = eqx.tree_at(lambda u: u.level, fit.unknowns, new)
     slopes, _ = whitened_slopes(packed_unknowns(unknowns, fit.free, room), problem, n)
@@ -318,7 +316,7 @@ def _mean_band(slopes: np.ndarray, covariance: np.ndarray) -> float:
 def _best(
     slopes: np.ndarray, covariance: np.ndarray, rows: np.ndarray, wanted: np.ndarray
 ) -> tuple[int, np.ndarray]:
-    """The candidate that leaves the smallest mean band, and the variances that it leaves."""
+    """The candidate with the smallest remaining mean band, and the remaining variances."""
     index = np.flatnonzero(wanted)
     candidates = rows[index]
     through = candidates @ covariance  # (state, part, unknown)
@@ -326,13 +324,13 @@ def _best(
     sensitivities = through @ slopes.T  # (state, part, output)
     gain = np.einsum("sio,sio->so", sensitivities, np.linalg.solve(inner, sensitivities))
     variance = np.einsum("op,pq,oq->o", slopes, covariance, slopes)
-    left = np.maximum(variance - gain, 0.0)
-    best = int(np.argmin(np.mean(np.sqrt(left), axis=1)))
-    return int(index[best]), left[best]
+    remaining = np.maximum(variance - gain, 0.0)
+    best = int(np.argmin(np.mean(np.sqrt(remaining), axis=1)))
+    return int(index[best]), remaining[best]
 
 
 def _reason(target: Target, before: np.ndarray, after: np.ndarray) -> Fact:
-    """Which band becomes narrower, and by what share."""
+    """Which band narrows, and by what fraction."""
     narrowed = 1 - np.sqrt(after / before)
     if target == "curves":
         fractions = dict(

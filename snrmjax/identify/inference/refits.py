@@ -1,9 +1,9 @@
-"""The unknowns of a joint fit as a function of all that it was given, with implicit derivatives.
+"""The unknowns of a joint fit as a function of its inputs, with implicit derivatives.
 
-At the optimum the gradient of half the sum of squares, states' errors and priors, is zero: s(θ, y)
-= 0. Its derivative by an input y is dθ/dy = −(∂s/∂θ)⁻¹ ∂s/∂y, however the optimum was found.
-Hyperparameters (magnitude of the noise, of levels' errors, roughness of the curves, weights of
-outliers) are the fit's and count as given.
+At the optimum the gradient of half the sum of squares (states' errors and priors) is zero: s(θ, y)
+= 0. By the implicit function theorem dθ/dy = −(∂s/∂θ)⁻¹ ∂s/∂y for an input y.
+Hyperparameters (1σ of noise, level errors and roughness, weights of outliers) are the fit's, and
+are held constant.
 Reference: Griewank & Walther, Evaluating Derivatives (2008), ch. 15, doi:10.1137/1.9780898717761.
 """
 
@@ -22,14 +22,14 @@ from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.numerics.compiled import compiled, on_numbers
 
 _MOST_STEPS = 50  # Gauss–Newton iterations of a refit
-_NO_WEIGHT = 1e-10  # of states that count for nothing, against division by zero
-_ARRIVED = 1e-9  # standard deviations, by which the last one moves
+_NO_WEIGHT = 1e-10  # of padding states, against division by zero
+_ARRIVED = 1e-9  # standard deviations: step at convergence
 
 
 class FitInputs(eqx.Module):
-    """Changes of all that a joint fit was given: relative ones, and of phases in rad.
+    """Changes of the inputs of a joint fit: relative, or in rad for phases.
 
-    Standard deviations, of the noise and of priors, are changed by their logarithm.
+    Standard deviations of noise and priors change by their logarithm.
     """
 
     amplitude: Float[Array, " state"]  # of the recorded velocities
@@ -38,14 +38,14 @@ class FitInputs(eqx.Module):
     natural_frequency: Float[Array, " mode"]  # of the linear modes
     damping_ratio: Float[Array, " mode"]
     participation: Float[Array, " mode"]
-    noise: Float[Array, " input"]  # 1σ of force, velocity, phase and wandering stiffness
-    level: Float[Array, " error"]  # 1σ of levels' gain, phase, stiffness and damping
+    noise: Float[Array, " input"]  # 1σ of force, velocity, phase and stiffness scatter
+    level: Float[Array, " error"]  # 1σ of level errors: gain, phase, stiffness and damping
     linear: Float[Array, " deviation"]  # 1σ as `PriorStd.linear`
-    roughness: Float[Array, " curve"]  # 1σ of what is expected of ω̃² and of 2ζ̃ω̃
+    roughness: Float[Array, " curve"]  # prior 1σ of the roughness of ω̃² and of 2ζ̃ω̃
 
     @classmethod
     def none(cls, fit: JointFit) -> "FitInputs":
-        """No change of anything."""
+        """No change."""
         states, modes = jnp.zeros(len(fit.data.level)), jnp.zeros(fit.modes.n_modes)
         linear, four = jnp.zeros(len(fit.prior.linear)), jnp.zeros(4)
         return cls(
@@ -54,7 +54,7 @@ class FitInputs(eqx.Module):
 
 
 class _Refit(eqx.Module):
-    """What a fit makes small, by its own unknowns in their 1σ from where they are."""
+    """Objective of a fit in its own unknowns, in 1σ from their fitted values."""
 
     vector: Float[Array, " entry"]
     unit: Float[Array, " entry"]
@@ -64,7 +64,7 @@ class _Refit(eqx.Module):
 
     @classmethod
     def of(cls, fit: JointFit) -> "_Refit":
-        """With room for more states and parameters: few sizes compile."""
+        """Padded states and parameters, so that few sizes compile."""
         program = fit.packed()
         std = np.sqrt(np.diag(program.padded_covariance(fit.covariance)))
         unit = jax.device_put(np.where(std > 0, std, 1.0))
@@ -72,13 +72,13 @@ class _Refit(eqx.Module):
         return cls(program.vector, unit, program.unravel, padded_problem(fit.problem), own)
 
     def changed(self, by: FitInputs) -> "_Refit":
-        """The same of other inputs."""
+        """The problem with changed inputs."""
         data, modes, prior = self.problem.data, self.problem.modes, self.problem.prior
         room = (0, len(data.level) - len(by.force))
-        turned = jnp.exp(jnp.pad(by.amplitude + 1j * by.phase, room))
+        phasor = jnp.exp(jnp.pad(by.amplitude + 1j * by.phase, room))
         data = dataclasses.replace(
             data,
-            velocity=data.velocity * turned,
+            velocity=data.velocity * phasor,
             force=data.force * jnp.exp(jnp.pad(by.force, room)),
             std=data.std * jnp.exp(by.noise),
         )
@@ -105,17 +105,17 @@ class _Refit(eqx.Module):
         return dataclasses.replace(self, problem=problem, unravel=unravel)
 
     def entries(self, point: Float[Array, " unknown"]) -> Float[Array, " entry"]:
-        """The whole vector at a point, in 1σ from the fit."""
+        """The full padded vector at a point given in 1σ from the fit."""
         own = jnp.array(self.own)
         return self.vector.at[own].add(point * self.unit[own])
 
     def solved(
         self, start: Float[Array, " unknown"]
     ) -> tuple[Float[Array, " unknown"], Float[Array, "state input"], Bool[Array, ""]]:
-        """The optimum, the states' errors there in their 1σ, and whether it was reached.
+        """The optimum, the states' errors there in their 1σ, and whether it converged.
 
-        By Gauss–Newton iterations with all errors as unknowns, which are eliminated state by state:
-        balances b made straight leave (SSᵀ)⁻¹(b − Se + J dθ) of each, and errors −Sᵀ times it.
+        Gauss–Newton with all errors as unknowns, eliminated state by state: the linearised balances
+        b have multipliers λ = (SSᵀ)⁻¹(b − Se + J dθ), and the errors are −Sᵀλ.
         """
         expected = jax.jacfwd(self.expected)
 
@@ -123,26 +123,28 @@ class _Refit(eqx.Module):
             point, errors, _, count = state
             slopes = self.by_error(point, errors)
             by_unknown = jax.jacfwd(lambda p: self.balances(p, errors))(point)
-            left = self.balances(point, errors) - jnp.einsum("sie,se->si", slopes, errors)
-            both = jnp.concatenate([left[:, :, None], by_unknown], axis=2)
-            pulled = jnp.linalg.solve(slopes @ slopes.mT, both)
+            residual = self.balances(point, errors) - jnp.einsum("sie,se->si", slopes, errors)
+            both = jnp.concatenate([residual[:, :, None], by_unknown], axis=2)
+            weighted = jnp.linalg.solve(slopes @ slopes.mT, both)
             prior = expected(point)
-            normal = jnp.einsum("sie,sif->ef", by_unknown, pulled[:, :, 1:]) + prior.T @ prior
-            gradient = jnp.einsum("sie,si->e", by_unknown, pulled[:, :, 0])
-            moved = jnp.linalg.solve(normal, gradient + prior.T @ self.expected(point))
-            errors = jnp.einsum("sie,si->se", slopes, pulled[:, :, 1:] @ moved - pulled[:, :, 0])
-            return point - moved, errors, jnp.max(jnp.abs(moved)), count + 1
+            normal = jnp.einsum("sie,sif->ef", by_unknown, weighted[:, :, 1:]) + prior.T @ prior
+            gradient = jnp.einsum("sie,si->e", by_unknown, weighted[:, :, 0])
+            change = jnp.linalg.solve(normal, gradient + prior.T @ self.expected(point))
+            errors = jnp.einsum(
+                "sie,si->se", slopes, weighted[:, :, 1:] @ change - weighted[:, :, 0]
+            )
+            return point - change, errors, jnp.max(jnp.abs(change)), count + 1
 
         def goes_on(state: tuple[Array, Array, Array, Array]) -> Array:
             return (state[2] > _ARRIVED) & (state[3] < _MOST_STEPS)
 
         exact = jnp.zeros_like(self.problem.data.std)
         first = (start, exact, jnp.array(jnp.inf), jnp.array(0))
-        point, errors, moved, _ = jax.lax.while_loop(goes_on, step, first)
-        return point, errors, moved <= _ARRIVED
+        point, errors, change, _ = jax.lax.while_loop(goes_on, step, first)
+        return point, errors, change <= _ARRIVED
 
     def expected(self, point: Float[Array, " unknown"]) -> Float[Array, " row"]:
-        """What the priors expect near zero, in its own 1σ."""
+        """Prior residuals, in units of their 1σ."""
         return prior_residuals(self.unravel(self.entries(point)), self.problem.prior)
 
     def by_error(
@@ -154,7 +156,7 @@ class _Refit(eqx.Module):
     def balances(
         self, point: Float[Array, " unknown"], errors: Float[Array, "state input"]
     ) -> Float[Array, "state part"]:
-        """The states' balances with errors in their 1σ."""
+        """Residuals of the states' balances, errors in their 1σ."""
         data = self.problem.data
         unit = data.std / jnp.sqrt(jnp.maximum(data.weight, _NO_WEIGHT))[:, None]
         unknowns = self.unravel(self.entries(point))
@@ -166,36 +168,36 @@ class _Refit(eqx.Module):
         errors: Float[Array, "state input"],
         multipliers: Float[Array, "state part"],
     ) -> tuple[Array, Array, Array]:
-        """What is zero at the optimum: slopes of ½ (errors² + priors²) + multipliers · balances by
+        """Optimality conditions: gradient of the Lagrangian ½ (errors² + priors²) + λ · balances by
         the unknowns and by the errors, and the balances.
         """
 
         def lagrangian(point: Array, errors: Array) -> tuple[Array, Array]:
-            left = self.balances(point, errors)
+            residual = self.balances(point, errors)
             squares = jnp.sum(self.expected(point) ** 2) + jnp.sum(errors**2)
-            return 0.5 * squares + jnp.sum(multipliers * left), left
+            return 0.5 * squares + jnp.sum(multipliers * residual), residual
 
-        by, left = jax.grad(lagrangian, argnums=(0, 1), has_aux=True)(point, errors)
-        return *by, left
+        by, residual = jax.grad(lagrangian, argnums=(0, 1), has_aux=True)(point, errors)
+        return *by, residual
 
 
 def _state_by_state(
     function: Callable[[Array], Array], errors: Float[Array, "state input"]
 ) -> Float[Array, "state row input"]:
-    """Derivatives of what every state has by its own errors: a push forward for each kind."""
+    """Derivatives by each state's own errors: one forward-mode product per kind of error."""
     kinds = jnp.broadcast_to(jnp.eye(errors.shape[1])[:, None], (errors.shape[1], *errors.shape))
     along = jax.vmap(lambda direction: jax.jvp(function, (errors,), (direction,))[1])
     return jnp.moveaxis(along(kinds), 0, 2)
 
 
 def _optimum(problem: _Refit) -> Float[Array, " unknown"]:
-    """The unknowns at the optimum, in 1σ from where they begin; NaN where it is not reached.
+    """The unknowns at the optimum, in 1σ from their start; NaN without convergence.
 
-    A last Newton step from there, errors and multipliers eliminated state by state, carries the
-    derivatives by all that the problem holds.
+    A final Newton step on the optimality conditions, with errors and multipliers eliminated state
+    by state, carries the implicit derivatives by all inputs.
     """
     fixed = jax.lax.stop_gradient(problem)
-    point, errors, good = fixed.solved(jnp.zeros(len(problem.own)))
+    point, errors, converged = fixed.solved(jnp.zeros(len(problem.own)))
     slopes = fixed.by_error(point, errors)
     square = slopes @ slopes.mT
     multipliers = -jnp.linalg.solve(square, (slopes @ errors[:, :, None]))[:, :, 0]
@@ -208,22 +210,22 @@ def _optimum(problem: _Refit) -> Float[Array, " unknown"]:
     solved = jnp.linalg.solve(blocks, by_unknown)
     whole = hessian - jnp.einsum("sie,sif->ef", by_unknown, solved)
     of_point, *of_states = problem.stationary(point, errors, multipliers)
-    left = of_point - jnp.einsum("sie,si->e", solved, jnp.concatenate(of_states, axis=1))
-    return jnp.where(good, point - jnp.linalg.solve(whole, left), jnp.nan)
+    residual = of_point - jnp.einsum("sie,si->e", solved, jnp.concatenate(of_states, axis=1))
+    return jnp.where(converged, point - jnp.linalg.solve(whole, residual), jnp.nan)
 
 
 def refit(fit: JointFit, changes: FitInputs) -> Unknowns:
-    """The unknowns of a joint fit whose inputs are changed, at the fit's hyperparameters.
+    """The unknowns of a joint fit with changed inputs, at the fit's hyperparameters.
 
-    Solves s(θ, y) = 0, the gradient of half the sum of squares that the fit makes small, by
-    Gauss–Newton iterations from the fit's unknowns on; derivatives are implicit, dθ/dy =
-    −(∂s/∂θ)⁻¹ ∂s/∂y, of first order, forward and reverse. Works inside `jax.jit` and `jax.vmap`.
+    Solves s(θ, y) = 0, the gradient of half the sum of squares, by Gauss–Newton iterations from the
+    fitted unknowns; derivatives are implicit, dθ/dy = −(∂s/∂θ)⁻¹ ∂s/∂y, of first order, forward and
+    reverse. Works inside `jax.jit` and `jax.vmap`.
 
     Arguments: `changes` as `FitInputs.none(fit)`, with other numbers.
-    Returns both curves, functions of amplitude, and everything else that was unknown; NaN where 50
-    iterations are not enough: make the changes smaller.
-    Validity: `fit_jointly` finds magnitudes of noise, levels' errors and roughness anew for other
-    states; here they stay. What several sensors say of one motion is weighted as in the fit.
+    Returns both curves and all other unknowns; NaN where 50 iterations do not converge: make the
+    changes smaller.
+    Validity: hyperparameters and the weights of several sensors stay as in the fit, where
+    `fit_jointly` would estimate them again.
     Reference: Griewank & Walther, Evaluating Derivatives (2008), ch. 15,
     doi:10.1137/1.9780898717761.
     """
@@ -236,21 +238,21 @@ def _own(fit: JointFit, point: Array | np.ndarray) -> Array:
 
 
 class Influence(eqx.Module):
-    """Derivatives of a fit's free unknowns by all that it was given, at its hyperparameters."""
+    """Derivatives of a fit's free unknowns by its inputs, at fixed hyperparameters."""
 
     names: tuple[str, ...] = eqx.field(static=True)  # of the unknowns
-    by: FitInputs  # with one more axis, the first: unknowns
+    by: FitInputs  # with a leading axis of unknowns
 
 
 @on_numbers("Differentiate `sj.identify.refit`.")
 def influence(fit: JointFit) -> Influence:
-    """How much every measured state, linear parameter and prior moves what a joint fit found.
+    """Sensitivity of a joint fit to every measured state, linear parameter and prior.
 
     Implicit derivatives at the optimum, as those of `refit`. Those of the curves follow from
     `values_at_displacement(fit, x).slopes @ influence(fit).by.amplitude` and so on.
 
     Returns derivatives of the free unknowns, in their units (`fit.names`, `fit.units`), by relative
-    changes of inputs and by phases in rad.
+    changes of the inputs and by phases in rad.
     Not differentiable: differentiate `sj.identify.refit`.
     """
     none = FitInputs.none(fit)
@@ -269,9 +271,9 @@ def _slopes(refit: _Refit, none: FitInputs) -> FitInputs:
 def bootstrap(
     fit: JointFit, n_samples: int = 200, *, seed: int = 0
 ) -> Float[np.ndarray, "sample unknown"]:
-    """Unknowns of refits to states drawn with replacement, within every level.
+    """Unknowns of refits to states resampled with replacement within every level.
 
-    A refit that does not converge is a row of NaN. What levels share is not seen by it.
+    A refit that does not converge is a row of NaN. Level errors are not resampled.
 
     Not differentiable: differentiate `sj.identify.refit`.
     """
@@ -293,7 +295,7 @@ def bootstrap(
 def _resampled(refit: _Refit, weights: Array) -> Float[Array, "sample unknown"]:
     def again(weight: Array) -> Array:
         weighted = dataclasses.replace(refit, problem=refit.problem.with_data(weight=weight))
-        point, _, good = weighted.solved(jnp.zeros(len(refit.own)))
-        return jnp.where(good, point, jnp.nan)
+        point, _, converged = weighted.solved(jnp.zeros(len(refit.own)))
+        return jnp.where(converged, point, jnp.nan)
 
     return jax.lax.map(again, weights)

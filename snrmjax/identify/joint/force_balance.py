@@ -1,8 +1,8 @@
-"""The complex force balance of all measured states: what a joint fit makes small.
+"""The complex force balance of all measured states: the residual that a joint fit minimises.
 
 With V the velocity of the nonlinear mode and X = V/(iΩ), a state balances when
-((ω̃² − Ω²) + iΩ·2ζ̃ω̃) X/A = F. Evaluated at the measured motion this has one value for every
-curve, however the response folds.
+((ω̃² − Ω²) + iΩ·2ζ̃ω̃) X/A = F. Evaluated at the measured motion the residual is single-valued,
+however the response folds.
 """
 
 import dataclasses
@@ -26,35 +26,33 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import as_numpy, compiled
 
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
-"""What every state may err in at random, relative or in rad; stiffness is never stated."""
+"""Random errors of every state, relative or in rad; that of the stiffness is never stated."""
 
 EXPONENTS = slice(-3, -1)
-"""Where in `Unknowns.linear` the exponents of the forcing frequency stand."""
+"""The frequency exponents among `Unknowns.linear`."""
 
-_FEWEST_STATES = 48  # that programs have room for
+_FEWEST_STATES = 48  # smallest padded number of states
 
 
 class BalanceData(eqx.Module):
-    """Measured states as the balance needs them: one velocity each."""
+    """Measured states reduced to one velocity each."""
 
     level: Int[Array, " state"]  # counted from zero
     frequency: Float[Array, " state"]  # rad/s
     force: Float[Array, " state"]  # N, or V where only the drive is known
-    velocity: Complex[Array, " state"]  # m/s, what the sensors together say of one of them
-    fraction: Shaped[
-        Array, "state sensor"
-    ]  # of the sensors in it; complex as `modal_filter` has them
-    participation: Float[Array, " state"]  # `SensedMode.ratio`: over that of the mode alone
+    velocity: Complex[Array, " state"]  # m/s at `sensor`, estimated from all sensors
+    fraction: Shaped[Array, "state sensor"]  # weights of the sensors in it, by `modal_filter`
+    participation: Float[Array, " state"]  # over that of the single mode: `SensedMode.ratio`
     std: Float[Array, "state input"]  # of `STATE_ERRORS`
     weight: Float[Array, " state"]  # 1, or less for an outlier under the robust loss
-    correction: Float[Array, "state input"]  # of `STATE_ERRORS`, what a fit adds to every record
-    away: Float[Array, " state"]  # ln of the forcing frequency over the record's natural one
+    correction: Float[Array, "state input"]  # of `STATE_ERRORS`: added to every record by the fit
+    detuning: Float[Array, " state"]  # ln(Ω/ω̃) from the record
     n_levels: int = eqx.field(static=True)
-    sensor: int = eqx.field(static=True)  # the one whose motion is meant
+    sensor: int = eqx.field(static=True)  # reference sensor
 
 
 class Unknowns(eqx.Module):
-    """Everything that a joint fit may change.
+    """All unknowns of a joint fit.
 
     Deviations of levels and linear parameters are in units of their own 1σ.
     """
@@ -62,69 +60,69 @@ class Unknowns(eqx.Module):
     squared_frequency: AbstractFamily  # ω̃², rad²/s²
     modal_damping: AbstractFamily  # 2ζ̃ω̃, 1/s
     log_force_gain: Float[Array, ""]
-    force_offset: Float[Array, ""]  # N, relative to the smallest force
+    force_offset: Float[Array, ""]  # relative to the smallest force
     instrument_phase: Float[Array, ""]  # rad
     level: Float[Array, "level error"]
     linear: Float[Array, " deviation"]  # as `PriorStd.linear`
 
 
 class PriorStd(eqx.Module):
-    """Prior standard deviations (1σ) of the unknowns that have one."""
+    """Prior standard deviations (1σ) of the unknowns."""
 
-    level: Float[Array, " error"]  # of `LEVEL_ERRORS`, stated or as the covariance has them
-    # Of the residual modes' natural frequencies (rad/s) and damping ratios, then of the exponents
-    # with which both curves go with the forcing frequency (`priors.OFF_RESONANCE`), and, relative,
-    # of the modal mass of the mode of interest.
+    level: Float[Array, " error"]  # of `LEVEL_ERRORS`, stated or estimated
+    # Of the residual modes' natural frequencies (rad/s) and damping ratios, then of both curves'
+    # exponents in the forcing frequency (`priors.OFF_RESONANCE`), and, relative, of the modal mass
+    # of the mode of interest.
     linear: Float[Array, " deviation"]
-    # 1 where a gain of the force is free: gains of levels are then the force's, and the measured
-    # velocities stay what they are; 0 where the force is known.
+    # 1 where the force gain is free: level gains then scale the force, not the measured velocities;
+    # 0 where the force is known.
     gain_of_force: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(0.0))
-    # Both over those with which the unknowns were found: few levels tell badly by how much levels
-    # differ, and the covariance has them wider (Student's t).
+    # Both over those used for the mean: 1σ from few levels is uncertain, and the covariance uses a
+    # wider one (Student's t).
     level_ratio: Float[Array, " error"] = eqx.field(default_factory=lambda: jnp.ones(4))
     linear_ratio: Float[Array, "*deviation"] = eqx.field(default_factory=lambda: jnp.ones(()))
-    # Of a further level.
+    # Of a new level.
     new_level: Float[Array, " error"] = eqx.field(default_factory=lambda: jnp.zeros(4))
 
 
 class BalanceProblem(eqx.Module):
-    """Measured states, the linear modes and the priors: all that the force balance needs."""
+    """Measured states, the linear modes and the priors."""
 
     data: BalanceData
     modes: LinearModes
     prior: PriorStd
 
     def with_data(self, **fields: Any) -> "BalanceProblem":
-        """The problem with other fields of its data."""
+        """The problem with these fields of its data replaced."""
         return dataclasses.replace(self, data=dataclasses.replace(self.data, **fields))
 
     @property
     def modal_constant(self) -> Float[Array, ""]:
-        """A = Φ_r Φᵀb in 1/kg of the model: 1/|A| is its modal mass, seen from force and sensor."""
+        """A = Φ_r Φᵀb in 1/kg of the model; 1/|A| is its modal mass, seen from force and sensor."""
         r, j = self.data.sensor, self.modes.mode_of_interest
         return as_numpy(self.modes.mode_shape)[r, j] * as_numpy(participation_of(self.modes))
 
     def modal_mass_of(self, unknowns: Unknowns) -> float:
-        """The modal mass in kg, seen from force and sensor, that the fit found."""
+        """The fitted modal mass in kg, seen from force and sensor."""
         return 1 / abs(float(self.constant_of(unknowns)))
 
     def constant_of(self, unknowns: Unknowns) -> Float[Array, ""]:
-        """`modal_constant` with the modal mass that the fit found."""
+        """`modal_constant` with the fitted modal mass."""
         logarithm = log_modal_mass(unknowns, self.prior.linear)
         exp: Any = jnp.exp if isinstance(logarithm, jax.Array) else np.exp
         return self.modal_constant * exp(-logarithm)
 
 
 def log_modal_mass(unknowns: Unknowns, linear_std: Float[Array, " deviation"]) -> Float[Array, ""]:
-    """The logarithm of the fit's modal mass over the model's: the last of the deviations."""
+    """ln of the fitted modal mass over the model's: the last of the deviations."""
     return as_numpy(unknowns.linear)[-1] * as_numpy(linear_std)[-1]
 
 
 def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " error"]:
-    """Stated 1σ of `LEVEL_ERRORS`, zero where nothing is stated, as for linear modes alone.
+    """Stated 1σ of `LEVEL_ERRORS`, zero where none is stated, as for linear modes alone.
 
-    A natural frequency with 1σ of σ rad/s has a relative stiffness with 2σ/ω; the damping ratio's
-    1σ counts relative to the linear one.
+    1σ of σ rad/s of the natural frequency is 2σ/ω of the stiffness; the damping ratio's 1σ is
+    relative to the linear one.
     Raises `ValueError` for a stated 1σ of the damping ratio of a mode without damping.
     """
     if isinstance(model, LinearModes):
@@ -143,9 +141,9 @@ def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " erro
 def stated_prior(
     modes: LinearModes, level_std: Float[np.ndarray, " error"], free: Sequence[str]
 ) -> PriorStd:
-    """Priors as they are stated, and for a modal mass of which nobody stated a 1σ.
+    """Stated priors, with a default for a modal mass of unstated 1σ.
 
-    A force gain that is `free` is one with the modal mass: the mass is then the model's.
+    A `free` force gain is indistinguishable from the modal mass, which is then the model's.
     """
     keep = np.asarray(modes.residual_modes, dtype=int)
     stated = modes.modal_mass_std
@@ -161,13 +159,12 @@ def stated_prior(
 def balance_data(
     data: SteadyStates, modes: LinearModes
 ) -> tuple[BalanceData, bool, tuple[int, ...]]:
-    """The states with a measured velocity, whether their noise is stated, their levels' numbers.
+    """The states with a measured velocity, whether their noise is stated, and the level numbers.
 
-    Where nobody stated any noise, force, amplitude and phase get the same relative error, larger
-    off resonance (`off_resonance_error_factor`); the fit then finds its size. Without an error of
-    the force a state near a fold would be exact in one direction, since amplitude and phase there
-    move the balance in the other: a force of which no error is stated gets a tenth of the
-    velocity's.
+    Without stated noise, force, amplitude and phase get the same relative error, larger off
+    resonance (`off_resonance_error_factor`), which the fit scales. Near a fold, amplitude and phase
+    errors move the balance in one direction only: a force without stated error gets a tenth of the
+    velocity's, so that the covariance stays regular.
     Raises `ValueError` where phases are unknown.
     """
     check_phases(data, "a joint fit")
@@ -197,7 +194,7 @@ def balance_data(
         "std": errors[keep],
         "weight": np.ones(int(keep.sum())),
         "correction": no_errors(int(keep.sum())),
-        "away": np.zeros(int(keep.sum())),
+        "detuning": np.zeros(int(keep.sum())),
     }
     # All at once: one by one they compile, a copy of every shape.
     measured = BalanceData(**jax.device_put(columns), n_levels=len(levels), sensor=r)
@@ -210,12 +207,12 @@ _one_sensor = compiled(modal_filter)
 def relative_participation(
     modes: LinearModes, frequency: Float[np.ndarray, " state"]
 ) -> Float[np.ndarray, " state"]:
-    """`SensedMode.ratio` of states at frequencies in rad/s."""
+    """`SensedMode.ratio` at each frequency in rad/s."""
     return np.broadcast_to(np.asarray(sensed_mode(modes, frequency).ratio), frequency.shape)
 
 
 def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:
-    """The modes with the residual ones' frequencies and dampings changed by deviation·1σ."""
+    """The modes, residual ones with frequency and damping changed by deviation·1σ."""
     keep = np.asarray(modes.residual_modes, dtype=int)
     change = deviation * spread
     return eqx.tree_at(
@@ -253,9 +250,9 @@ def velocity_of_others(
     deviation: Float[np.ndarray | Array, " deviation"],
     force: Float[np.ndarray, " state"],
 ) -> Complex[np.ndarray, " state"]:
-    """Velocity of all but the mode of interest under forces in N, by the sensors' shares.
+    """Velocity of all but the mode of interest under forces in N, weighted over the sensors.
 
-    The linear modes deviate by so many of their 1σ. One program serves many numbers of states.
+    `deviation` of the linear modes is in their 1σ. States are padded, so that few sizes compile.
     """
     data, change = problem.data, (deviation, problem.prior.linear)
     n, size = len(force), with_room(len(force))
@@ -263,11 +260,10 @@ def velocity_of_others(
     return np.asarray(_velocity_of_others(problem.modes, change, *rows))[:n]
 
 
-def _freed(unknowns: Unknowns, problem: BalanceProblem, error: Any, xp: Any) -> tuple[Any, Any]:
-    """Force in N and velocity in m/s of every state, without what levels and instruments err by.
+def _corrected(unknowns: Unknowns, problem: BalanceProblem, error: Any, xp: Any) -> tuple[Any, Any]:
+    """Force in N and velocity in m/s of every state, corrected for level and instrument errors.
 
-    By NumPy or JAX, as `xp` says. `error` adds to the logarithms of force and velocity and to the
-    phase.
+    `xp` is NumPy or JAX's. `error` adds to the logarithms of force and velocity and to the phase.
     """
     data, prior = problem.data, problem.prior
     level = (unknowns.level * prior.level)[data.level]
@@ -275,25 +271,27 @@ def _freed(unknowns: Unknowns, problem: BalanceProblem, error: Any, xp: Any) -> 
     force = data.force * xp.exp(unknowns.log_force_gain + of_force + error[:, 0])
     force = force + unknowns.force_offset * xp.min(data.force)
     phase = error[:, 2] - level[:, 1] - unknowns.instrument_phase
-    turned = error[:, 1] - level[:, 0] + of_force + 1j * phase
-    return force, data.velocity * xp.exp(turned)
+    log_factor = error[:, 1] - level[:, 0] + of_force + 1j * phase
+    return force, data.velocity * xp.exp(log_factor)
 
 
 def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
-    """The mode's motion in the states as they were recorded, by the host."""
-    found, given = jax.tree.map(np.asarray, (unknowns, problem))
-    force, velocity = _freed(found, given, no_errors(len(given.data.level)), np)
+    """The mode's motion in the recorded states, computed on the host."""
+    host_unknowns, host_problem = jax.tree.map(np.asarray, (unknowns, problem))
+    force, velocity = _corrected(
+        host_unknowns, host_problem, no_errors(len(host_problem.data.level)), np
+    )
     of_mode = velocity - velocity_of_others(problem, unknowns.linear, force)
-    return Motion(of_mode, np.abs(of_mode) / given.data.frequency, force)
+    return Motion(of_mode, np.abs(of_mode) / host_problem.data.frequency, force)
 
 
 @compiled
 def force_balance(
     unknowns: Unknowns, problem: BalanceProblem, error: Float[Array, "state input"]
 ) -> Float[Array, "state part"]:
-    """Force needed for the measured motion minus the force, over the force: real and imaginary."""
+    """(Force required for the measured motion − force) / force: real and imaginary part."""
     data, prior = problem.data, problem.prior
-    force, velocity = _freed(unknowns, problem, error, jnp)
+    force, velocity = _corrected(unknowns, problem, error, jnp)
     linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
     others = residual_velocity(linear, jnp.asarray(data.frequency), force)
     of_mode = velocity - jnp.sum(data.fraction * others, axis=1)
@@ -301,34 +299,34 @@ def force_balance(
     level = (unknowns.level * prior.level)[data.level]
     squared = unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency))
     damping = unknowns.modal_damping(motion.amplitude(unknowns.modal_damping))
-    softer, faster = (unknowns.linear * prior.linear)[EXPONENTS]
+    stiffness_exponent, damping_exponent = (unknowns.linear * prior.linear)[EXPONENTS]
     at_rest = unknowns.squared_frequency(jnp.zeros(()))
     added = jnp.where(jnp.isfinite(at_rest), squared - at_rest, squared)
-    squared = squared * (1 + level[:, 2] + error[:, 3]) + softer * data.away * added
-    damping = damping * (1 + level[:, 3] + faster * data.away)
+    squared = squared * (1 + level[:, 2] + error[:, 3]) + stiffness_exponent * data.detuning * added
+    damping = damping * (1 + level[:, 3] + damping_exponent * data.detuning)
     omega = data.frequency
     stiffness = squared - omega**2 + 1j * omega * damping
     constant = problem.constant_of(unknowns) * data.participation
     needed = stiffness * motion.velocity / (1j * omega * constant)
-    # Relative to the recorded force, but with no advantage from a larger gain.
+    # Relative to the force, without a derivative by its gain: a large gain must not pay.
     unit = jax.lax.stop_gradient(motion.force * jnp.exp(-error[:, 0])) * jnp.exp(error[:, 0])
     excess = (needed - motion.force) / unit
     return jnp.stack([excess.real, excess.imag], axis=1)
 
 
 def with_room(n_states: int) -> int:
-    """So many states have room for these, so that few sizes compile."""
+    """Padded number of states, so that few sizes compile."""
     power = 1 << (n_states - 1).bit_length()
     return max(n_states, _FEWEST_STATES, 3 * power // 4 if n_states <= 3 * power // 4 else power)
 
 
 def filled(rows: Array | np.ndarray, size: int, spare: float | None) -> np.ndarray:
-    """Rows and spare ones, of one number or, without it, copies of the last."""
+    """Rows padded to `size` with `spare`, or with copies of the last row."""
     known = np.asarray(rows)
     missing = np.repeat(known[-1:], size - len(known), axis=0)
     return np.concatenate([known, missing if spare is None else np.full_like(missing, spare)])
 
 
 def no_errors(n_states: int) -> Float[np.ndarray, "state input"]:
-    """States as they were recorded."""
+    """Zero errors: the states as recorded."""
     return np.zeros((n_states, len(STATE_ERRORS)))

@@ -1,4 +1,4 @@
-"""The unknowns that a fit may change as one vector, and what it makes small by them."""
+"""The free unknowns of a fit as one vector, and the derivatives of its residuals."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -26,14 +26,14 @@ from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
 
-_LEVELS = 8  # come in so many
+_LEVELS = 8  # levels are padded to multiples of it
 
 FREE = ("force_gain", "force_offset", "instrument_phase")
-"""Unknowns of the measurement that a fit may free."""
+"""Unknowns of the measurement that a fit may estimate."""
 
 
 class Unravel(eqx.Module):
-    """From a vector of free unknowns to all of them."""
+    """Map from the vector of free unknowns to all unknowns."""
 
     unknowns: Unknowns
     free: tuple[str, ...] = eqx.field(static=True)
@@ -44,7 +44,7 @@ class Unravel(eqx.Module):
         leaves = jax.tree.leaves(moving)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return ravel_pytree(moving)[0]
-        # On the host nothing compiles for one more size.
+        # On the host, which compiles nothing for a new size.
         return jax.device_put(np.concatenate([np.ravel(np.asarray(leaf)) for leaf in leaves]))
 
     def __call__(self, vector: Float[Array, " unknown"]) -> Unknowns:
@@ -60,9 +60,9 @@ class Unravel(eqx.Module):
 
 
 class PackedUnknowns(NamedTuple):
-    """The free unknowns as compiled programs take them: with curves of one form and size.
+    """The free unknowns for compiled programs: curves padded to one form and size.
 
-    `own` says where in the longer vector the fit's own unknowns are; the others move nothing.
+    `own` are the indices of the fit's unknowns in the padded vector; the other entries are inert.
     """
 
     vector: Float[Array, " entry"]
@@ -72,7 +72,7 @@ class PackedUnknowns(NamedTuple):
     def padded_covariance(
         self, covariance: Float[np.ndarray, "unknown unknown"]
     ) -> Float[np.ndarray, "entry entry"]:
-        """A covariance of the fit's unknowns among all entries of the vector."""
+        """The covariance of the fit's unknowns, padded to all entries of the vector."""
         full = np.zeros((len(self.vector), len(self.vector)))
         full[np.ix_(self.own, self.own)] = covariance
         return full
@@ -81,7 +81,7 @@ class PackedUnknowns(NamedTuple):
 def packed_unknowns(
     unknowns: Unknowns, free: tuple[str, ...], n_levels: int | None = None
 ) -> PackedUnknowns:
-    """Unknowns for a program that serves every family, and so many levels."""
+    """Unknowns padded for a program that serves every family and `n_levels` levels."""
     curves, present = (unknowns.squared_frequency, unknowns.modal_damping), len(unknowns.level)
     most = max(curve.parameters.shape[0] for curve in curves)
     pair = tuple(packed(curve, most) for curve in curves)
@@ -96,17 +96,17 @@ def packed_unknowns(
     linear = len(vector) - len(unknowns.linear)
     spare = (len(whole.level) - present) * len(LEVEL_ERRORS)
     rest = (*range(size + other, linear - spare), *range(linear, len(vector)))
-    places = [*range(n), *range(size, size + m), *rest]
-    return PackedUnknowns(vector, Unravel(whole, free), np.array(places))
+    indices = [*range(n), *range(size, size + m), *rest]
+    return PackedUnknowns(vector, Unravel(whole, free), np.array(indices))
 
 
 def padded_levels(n_levels: int) -> int:
-    """So many levels have room for these: levels come in eights, so that few sizes compile."""
+    """Padded number of levels, a multiple of eight, so that few sizes compile."""
     return _LEVELS * -(-n_levels // _LEVELS)
 
 
 def padded_problem(problem: BalanceProblem) -> BalanceProblem:
-    """The problem with padding states of no weight and padding levels: few sizes compile."""
+    """The problem padded with zero-weight states and levels, so that few sizes compile."""
     data, size = problem.data, with_room(len(problem.data.level))
     roomy = jax.tree.map(lambda a: filled(a, size, None), data)
     weight, levels = filled(data.weight, size, 0.0), padded_levels(data.n_levels)
@@ -115,7 +115,7 @@ def padded_problem(problem: BalanceProblem) -> BalanceProblem:
 
 
 def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:
-    """Which leaves a fit may change, as a filter of `equinox.partition`."""
+    """Leaves that a fit may change, as a filter for `equinox.partition`."""
     frozen = jax.tree.map(lambda _: False, unknowns)
     moving = [
         *("force_gain" in free, "force_offset" in free, "instrument_phase" in free),
@@ -139,7 +139,7 @@ def named_unknowns(
 ) -> tuple[tuple[str, str], ...]:
     """Names and units of the free unknowns in the order of their vector.
 
-    Arguments: `numbers` the levels' own, in place of counting them from 0.
+    Arguments: `numbers` of the levels in the file; by default counted from 0.
     """
     curves = (
         ("backbone", "rad^2/s^2", unknowns.squared_frequency),
@@ -165,7 +165,7 @@ def named_unknowns(
 def _slopes(vector: Array, unravel: Unravel, problem: BalanceProblem) -> tuple[Array, Array]:
     """Derivatives of the balance by the unknowns, and by the states' errors.
 
-    Every state has its own: one push forward for each kind of error gives them all.
+    A state depends on its own errors only: one forward-mode product per kind of error gives all.
     """
     at = problem.data.correction
     n_states, kinds = at.shape
@@ -179,21 +179,20 @@ def _slopes(vector: Array, unravel: Unravel, problem: BalanceProblem) -> tuple[A
 def whitened_slopes(
     program: PackedUnknowns, problem: BalanceProblem, n_states: int
 ) -> tuple[Float[np.ndarray, "state part unknown"], Float[np.ndarray, "state part input"]]:
-    """Derivatives of the first states' balances, by the fit's own unknowns and by relative errors
-    of the states (`STATE_ERRORS`), in rows of unit variance where errors are as large as stated.
+    """Whitened derivatives of the first states' balances, by the fit's unknowns and by relative
+    errors of the states (`STATE_ERRORS`): rows have unit variance where errors are as stated.
 
-    At the states corrected for their errors, which lie on the curves: there slopes do not go up and
-    down with the noise.
+    Evaluated at the corrected states, which lie on the curves: noise does not enter the slopes.
     """
-    found = _slopes(program.vector, program.unravel, problem)
-    by_unknown, by_error = (np.asarray(part)[:n_states] for part in found)
+    slopes = _slopes(program.vector, program.unravel, problem)
+    by_unknown, by_error = (np.asarray(part)[:n_states] for part in slopes)
     std, weight = (np.asarray(p)[:n_states] for p in (problem.data.std, problem.data.weight))
     root, _ = whitening(by_error[:, 0] + 1j * by_error[:, 1], std, weight)
     return root @ by_unknown[:, :, program.own], root @ by_error
 
 
 def prior_residuals(unknowns: Unknowns, prior: PriorStd) -> Float[Array, " residual"]:
-    """What is expected near zero of levels, linear parameters and curves, in its own 1σ."""
+    """Prior residuals of level errors, linear parameters and curves, in units of their 1σ."""
     curves = (unknowns.squared_frequency, unknowns.modal_damping)
     level = (unknowns.level * prior.level_ratio).reshape(-1)
     linear = unknowns.linear * prior.linear_ratio

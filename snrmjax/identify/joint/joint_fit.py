@@ -55,16 +55,15 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
 
-_MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
+_MOVED = 2.0  # standard deviations from which a level error is reported
 
 
 class JointFit(AbstractResult):
-    """Two curves, what else was unknown, and how well all of it is known.
+    """Both fitted curves, all other unknowns, and their covariance.
 
-    `covariance` belongs to the free unknowns in the order of `names`, and includes the correlation
-    of neighbouring states' residuals. `noise.level_std` belongs
-    to `LEVEL_ERRORS`, stated or estimated: what was estimated from few levels counts for more in
-    `prior` and in the covariance, as Student's t does.
+    `covariance` is of the free unknowns in the order of `names`, and allows for the correlation of
+    neighbouring states' residuals. `noise.level_std` is of `LEVEL_ERRORS`, stated or estimated;
+    estimates from few levels are widened in `prior` and in the covariance, as by Student's t.
     """
 
     coordinates = ("parameter",)
@@ -73,7 +72,7 @@ class JointFit(AbstractResult):
     covariance: Float[np.ndarray, "unknown unknown"]
     problem: BalanceProblem
     noise: NoiseEstimate
-    # Of unit variance if all is right.
+    # Unit variance if the model holds.
     residuals: Float[np.ndarray, "state part"] = quantity(
         "state part", "1", "whitened residual", name="residual"
     )
@@ -81,17 +80,17 @@ class JointFit(AbstractResult):
     free: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[Fact, ...] = setting()
     converged: bool = eqx.field(static=True)
-    level_numbers: tuple[int, ...] = eqx.field(static=True)  # of the file; `data` counts from 0
+    level_numbers: tuple[int, ...] = eqx.field(static=True)  # in the file; `data` counts from 0
 
     @property
     def status(self) -> str:
-        """How the fit ended, in words."""
+        """Convergence of the fit, in words."""
         more = "not converged: fit and noise estimate still changed one another in the last round"
         return "converged" if self.converged else more
 
     @property
     def data(self) -> BalanceData:
-        """The states as the fit sees them."""
+        """The states as the fit uses them."""
         return self.problem.data
 
     @property
@@ -101,25 +100,25 @@ class JointFit(AbstractResult):
 
     @property
     def prior(self) -> PriorStd:
-        """Prior standard deviations, those estimated from the levels included."""
+        """Prior standard deviations, including those estimated from the levels."""
         return self.problem.prior
 
     @property
     def largest(self) -> tuple[float, float]:
-        """Largest displacement (m) and velocity (m/s), as measured: no gain moves them."""
+        """Largest measured displacement (m) and velocity (m/s), without level-gain correction."""
         motion = self.motion()
         level = np.asarray(self.unknowns.level) * np.asarray(self.prior.level)
         of_velocity = 1 - float(self.prior.gain_of_force)
         recorded = np.exp(of_velocity * level[np.asarray(self.data.level), 0])
         pair = (np.asarray(motion.displacement), np.abs(np.asarray(motion.velocity)))
-        displacement, velocity = (float(np.max(recorded * size)) for size in pair)
+        displacement, velocity = (float(np.max(recorded * amplitude)) for amplitude in pair)
         return displacement, velocity
 
     @property
     def modes_found(self) -> LinearModes:
-        """The linear modes with the modal mass that the fit found for the mode of interest.
+        """The linear modes with the fitted modal mass of the mode of interest.
 
-        Its 1σ, where one was stated, is then the fit's.
+        Its 1σ, where one was stated, is the fit's.
         """
         fraction = self.problem.constant_of(self.unknowns) / self.problem.modal_constant
         j, modes = self.modes.mode_of_interest, self.modes
@@ -137,16 +136,16 @@ class JointFit(AbstractResult):
         return eqx.tree_at(lambda m: m.modal_mass_std, scaled, jax.device_put(std))
 
     def motion(self) -> Motion:
-        """The nonlinear mode's motion in the states as the fit sees it."""
+        """Motion of the nonlinear mode in all states, by the fitted unknowns."""
         return recorded_motion(self.unknowns, self.problem)
 
     def recorded_force(self, force: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-        """What the test records of a force in N: in N, or in V where only the drive is known."""
+        """The record of a force in N: in N, or in V where only the drive is known."""
         gain, offset = self._force_line()
         return (np.asarray(force) - offset) / gain
 
     def force_of_drive(self, drive: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-        """The force in N that belongs to what a test records (`recorded_force`)."""
+        """The force in N of a record (inverse of `recorded_force`)."""
         gain, offset = self._force_line()
         return np.asarray(drive) * gain + offset
 
@@ -156,20 +155,20 @@ class JointFit(AbstractResult):
         return float(np.exp(float(self.unknowns.log_force_gain))), offset
 
     def vector(self) -> tuple[Float[Array, " unknown"], Unravel]:
-        """The free unknowns as a vector, and the way back to all of them."""
+        """The free unknowns as a vector, and the map back to all unknowns."""
         unravel = Unravel(self.unknowns, self.free)
         return unravel.vector(), unravel
 
     def packed(self) -> PackedUnknowns:
-        """The free unknowns as compiled programs take them."""
+        """The free unknowns padded for compiled programs."""
         return packed_unknowns(self.unknowns, self.free, padded_levels(self.data.n_levels))
 
     def names(self) -> tuple[str, ...]:
-        """What the free unknowns are called."""
+        """Names of the free unknowns."""
         return tuple(name for name, _ in named_unknowns(self.unknowns, self.data, self.free))
 
     def units(self) -> tuple[str, ...]:
-        """Units of the free unknowns; a curve's terms count at the largest amplitude."""
+        """Units of the free unknowns; a curve's terms are their values at the largest amplitude."""
         return tuple(unit for _, unit in named_unknowns(self.unknowns, self.data, self.free))
 
     def summary(self) -> tuple[str, ...]:
@@ -178,7 +177,7 @@ class JointFit(AbstractResult):
         motion = self.motion()
         omega = np.sqrt(np.asarray(squared(motion.amplitude(squared))))
         ratio = np.asarray(damping(motion.amplitude(damping))) / (2 * omega)
-        size = np.abs(np.asarray(motion.velocity))
+        speed = np.abs(np.asarray(motion.velocity))
         scale = f"{self.noise.scale:.3g} ± {self.noise.scale_std:.1g}"
         noise = f"{scale} times the stated noise"
         if not self.noise.stated:
@@ -186,7 +185,7 @@ class JointFit(AbstractResult):
         return (
             f"JointFit: natural frequency: {squared.words}; damping: {damping.words}",
             f"{len(self.data.level)} steady states of {self.data.n_levels} levels at "
-            f"{self.modes.sensors[self.data.sensor]!r}, {size.min():.3g} to {size.max():.3g} m/s",
+            f"{self.modes.sensors[self.data.sensor]!r}, {speed.min():.3g} to {speed.max():.3g} m/s",
             f"natural frequency {omega.min() / HERTZ:.6g} to {omega.max() / HERTZ:.6g} Hz, "
             f"damping ratio {100 * ratio.min():.3g} to {100 * ratio.max():.3g} %",
             f"residuals: {noise}",
@@ -199,7 +198,7 @@ class JointFit(AbstractResult):
         std, data, per = np.sqrt(np.diag(self.covariance)), self.data, ("parameter",)
         state, force = ("state",), "V" if self.drive_known_only else "N"
         measured, numbers = np.asarray(data.force), np.array(self.level_numbers)
-        # With the levels' own numbers, for readers.
+        # With the level numbers of the file.
         named = named_unknowns(self.unknowns, data, self.free, self.level_numbers)
         labels = [name for name, _ in named]
         return {
@@ -243,31 +242,29 @@ def fit_jointly(
 ) -> JointFit:
     """Fit both curves to the complex force balance of all states at once.
 
-    The model of a test (`identify.test_model`) says how smooth the curves are, how large the noise
-    is and by how much levels differ in gain, phase, stiffness and damping, each with a stated prior
-    and by the largest probability of the data; smooth curves, their bands and all else are its
-    posterior. A family by name takes the place of smooth functions in it, with a smooth remainder:
-    what its terms leave is a curve too, whose magnitude is exactly zero where noise explains it
-    (`family_leaves` among the notes where it does not, and the bands include it).
-    States are corrected for their most likely errors (orthogonal distance regression); other modes'
-    frequencies and dampings, and how both curves go with the forcing frequency at equal amplitude,
-    are unknowns too. Where states exceed the stated noise the bands are wider for it. The modal
+    The model of a test (`identify.test_model`) estimates the smoothness of the curves, the noise,
+    and by how much levels differ in gain, phase, stiffness and damping, by empirical Bayes with
+    stated priors; smooth curves, bands and all other unknowns are its posterior. A family by name
+    replaces the smooth curve, with a smooth remainder that is exactly zero where noise explains it;
+    elsewhere the notes contain `family_leaves`, and the bands include the remainder.
+    States are corrected for their most likely errors (orthogonal distance regression). The other
+    modes' frequencies and dampings, and the dependence of both curves on the forcing frequency at
+    equal amplitude, are unknowns too. Residuals above the stated noise widen the bands. The modal
     mass is an unknown with its stated 1σ (`LinearModesStd.modal_mass`); where none is stated it is
-    the model's, unless states away from resonance ask for another. A free force gain is one with
-    it.
+    the model's, unless states off resonance contradict it. A free force gain cannot be
+    distinguished from it.
 
-    Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
-    ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
-    the simplest that lies in the band of the smooth curve. "auto" is that curve itself, a
-    smoothing spline. `free` may name "force_gain", "force_offset" and "instrument_phase"; the gain
-    is always free where only the drive is known. `modes` may be a structure, which also states the
-    1σ of what the states of a level share: gain, phase, natural frequency and damping ratio.
-    `level_gain_std` (relative) and `level_phase_std` (rad), where given, stand in place of the
-    first two.
-    Returns a `JointFit`, whose `status` says whether it converged.
+    Arguments: `backbone` and `damping` name a family of `FAMILIES`, optionally with its order
+    ("polynomial:2", "spline:5") and amplitude ("polynomial:2@velocity"); by default the simplest
+    that lies within the band of the smooth curve. "auto" is that curve itself, a smoothing spline.
+    `free` may name "force_gain", "force_offset" and "instrument_phase"; the gain is always free
+    where only the drive is known. `modes` may be a structure, which also states the 1σ of level
+    errors: gain, phase, natural frequency and damping ratio. `level_gain_std` (relative) and
+    `level_phase_std` (rad), where given, replace the first two.
+    Returns a `JointFit`; its `status` reports convergence.
     Raises `ValueError` for too few states, an unknown family or name, a family with more parameters
-    than there are data, a gain, an offset or a phase that the data do not determine, and a fit that
-    needs a modal mass or a damping below zero.
+    than data, a gain, offset or phase that the data do not determine, and a fit with negative modal
+    mass or damping.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
     Not differentiable: differentiate `snrmjax.identify.refit`.
     """
@@ -294,32 +291,32 @@ def fit_jointly(
     }
     if len(knots) > 1:
         raise ValueError(
-            f"smooth curves have their knots in common: give both one size, not {min(knots)} "
+            f"both smooth curves share their knots: give both the same number, not {min(knots)} "
             f"and {max(knots)}."
         )
     problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
-    size = max(knots, default=None)
-    view = view_of(problem, choices, released, stated, robust=robust, knots=size)
+    most_knots = max(knots, default=None)
+    view = view_of(problem, choices, released, stated, robust=robust, knots=most_knots)
     posterior, unknowns = view.posterior, viewed_unknowns(view)
     covariance = viewed_covariance(view)
     level, frequency = np.asarray(measured.level), np.asarray(measured.frequency)
     autocorrelation = residual_autocorrelation(
         posterior.residuals, states_of_levels(level, frequency)
     )
-    # What levels differ by is said where the data ask for it or the fit made use of it, and stays
-    # possible elsewhere.
+    # Level errors are reported where they are significant or the fit used them; the prior allows
+    # for them elsewhere too.
     differ = np.array(posterior.differing) | _moved(unknowns, covariance)
-    said = np.where(level_std > 0, level_std, np.where(differ, view.noise.level_std, 0.0))
+    reported = np.where(level_std > 0, level_std, np.where(differ, view.noise.level_std, 0.0))
     fit = JointFit(
         unknowns=unknowns,
         covariance=covariance,
         problem=view.problem,
-        noise=dataclasses.replace(view.noise, level_std=said, autocorrelation=autocorrelation),
+        noise=dataclasses.replace(view.noise, level_std=reported, autocorrelation=autocorrelation),
         residuals=posterior.residuals,
         drive_known_only=driven,
         free=released,
         notes=(),
-        converged=bool(posterior.settled),
+        converged=bool(posterior.converged),
         level_numbers=numbers,
     )
     notes = notes_on_instruments(fit)
@@ -336,7 +333,7 @@ def fit_jointly(
 
 @on_numbers("Differentiate `sj.identify.refit`.")
 def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
-    """The states with the force and the phase that a joint fit found for their instruments.
+    """The states with force and phase corrected by a joint fit's instrument errors.
 
     Where only a drive voltage is known, the force in N is that voltage times the fitted gain.
 
@@ -345,20 +342,20 @@ def corrected_states(data: SteadyStates, fit: JointFit) -> SteadyStates:
     unknowns = fit.unknowns
     nominal = np.asarray(data.drive if fit.drive_known_only else data.force)
     offset = float(unknowns.force_offset) * np.min(np.asarray(fit.data.force))
-    found = (
+    corrected = (
         nominal * np.exp(float(unknowns.log_force_gain)) + offset,
         np.asarray(data.velocity) * np.exp(-1j * float(unknowns.instrument_phase)),
     )
-    return eqx.tree_at(lambda d: (d.force, d.velocity), data, jax.device_put(found))
+    return eqx.tree_at(lambda d: (d.force, d.velocity), data, jax.device_put(corrected))
 
 
 def _notes(
     fit: JointFit, frequency_jitter_std: float, stated: Float[np.ndarray, " error"], named: bool
 ) -> list[Fact]:
-    """All that a reader of a joint fit should know.
+    """Notes of a joint fit.
 
     Arguments: `frequency_jitter_std` 1σ of the natural frequency from state to state, relative;
-    `stated` 1σ of levels' errors; `named` whether a family was chosen for a curve.
+    `stated` 1σ of levels' errors; `named` whether a family was requested for a curve.
     """
     notes = []
     if not fit.converged:
@@ -389,7 +386,7 @@ def _notes(
 def _moved(
     unknowns: Unknowns, covariance: Float[np.ndarray, "unknown unknown"]
 ) -> Bool[np.ndarray, " error"]:
-    """In which kinds of error a fit moved a level by more than chance does."""
+    """Kinds of level errors that are significant for any level."""
     level, end = np.asarray(unknowns.level), len(covariance) - len(unknowns.linear)
     std = np.sqrt(np.diag(covariance))[end - level.size : end].reshape(level.shape)
     beyond = np.abs(level) > _MOVED * np.where(std > 0, std, np.inf)

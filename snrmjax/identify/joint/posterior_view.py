@@ -1,4 +1,4 @@
-"""A joint fit as the posterior of a test has it: unknowns, covariance, noise and levels."""
+"""A joint fit from the posterior of a test: unknowns, covariance, noise and level errors."""
 
 import dataclasses
 import functools
@@ -24,28 +24,28 @@ from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.balance import off_resonance
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
 from snrmjax.identify.test_model.curve_terms import CurveTerms
+from snrmjax.identify.test_model.gauss_newton import Rounds
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE, WITH_FREQUENCY
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
-from snrmjax.identify.test_model.walk import Rounds
 
-_FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
+_FREE = 3.0  # 1σ of unknown instrument errors about their initial guess
 LEAST_LEFT = 0.25
-"""Of the residuals, that no number of unknowns can take."""
+"""Lower bound of the residual degrees of freedom, as a fraction of the rows."""
 
 SMOOTH = ("auto", SmoothingSpline.kind)
-"""Families that are the posterior's own curves."""
+"""Families that are the posterior's smooth curves."""
 
-_ASKED = 3.0  # standard deviations from the model's modal mass where nobody stated its error
+_ASKED = 3.0  # standard deviations from which a modal mass of unstated error is not the model's
 
 
 class View(NamedTuple):
-    """The posterior of a joint fit's states, and how the fit's problem is made of it."""
+    """The posterior of a joint fit's states, and the problem with its estimates."""
 
     posterior: TestPosterior
-    problem: BalanceProblem  # with the noise, levels and corrections that the posterior has
-    gain: complex  # of the force, and phase of the velocity, as guessed beforehand
+    problem: BalanceProblem  # with the posterior's noise, level errors and corrections
+    gain: complex  # initial guess: gain of the force, phase of the velocity
     free: tuple[str, ...]
     noise: NoiseEstimate
 
@@ -59,18 +59,16 @@ def view_of(
     robust: bool,
     knots: int | None = None,
 ) -> View:
-    """The posterior of a joint fit's states, with curves of the families asked for.
+    """The posterior of a joint fit's states, with curves of the chosen families.
 
-    A family by name begins where it is nearest to the smooth curves, which the states are fitted
-    by first.
+    Smooth curves are fitted first; a family starts from its member nearest to them.
 
-    Stated noise that the states exceed widens the bands by as much. A modal mass of which
-    nobody stated an error is the model's, unless the states ask for another, which those at a
-    controlled phase cannot; a frequency that wanders is an error of every state where the states
-    ask for it.
+    Residuals above the stated noise widen the bands accordingly. A modal mass of unstated error is
+    the model's, unless the states contradict it, which those at a controlled phase cannot;
+    frequency scatter is added to every state's errors where the states show it.
 
-    Arguments: `free` what of the instruments nobody knows; `stated` whether noise is; `knots` how
-    many the curves have at most.
+    Arguments: `free` the unknown instrument errors; `stated` whether the noise is; `knots` the
+    largest number of each curve.
     """
     guess = _complex_gain(problem) if {"force_gain", "instrument_phase"} & set(free) else 1.0 + 0j
     gain = abs(guess) if "force_gain" in free else 1.0
@@ -81,7 +79,7 @@ def view_of(
     fit = functools.partial(fit_test, robust=robust, power_likelihood=True)
     first = functools.partial(fit, compare_levels=False, parts_of_noise=True)
     posterior = first(states, rounds=rounds)
-    if _noise_of(posterior, stated).exceeded:  # curves may be steeper than their knots let them
+    if _noise_of(posterior, stated).exceeded:  # the curves may be steeper than the knots resolve
         posterior = first(states, rounds=rounds._replace(crowded=True))
     mass, std = posterior.modal_mass
     if assumed and (posterior.phase_is_controlled or abs(mass - 1) <= _ASKED * std):
@@ -95,24 +93,24 @@ def view_of(
     start = rounds._replace(start=posterior)
     if named:
         terms = _terms(posterior, choices, 0), _terms(posterior, choices, 1)
-        # A family with its remainder follows states as well as smooth curves do: as many count.
+        # A family with remainder fits as well as smooth curves: keep the independent fraction.
         start = start._replace(start=posterior.beginning(terms=terms), same_fraction=True)
-        whole = fit(states, compare_levels=False, rounds=start)
-        terms = _kept(whole, 0), _kept(whole, 1)
-        start = start._replace(start=whole.beginning(terms=terms))
-    posterior = fit(states, over_sizes=True, rounds=start)
+        with_remainder = fit(states, compare_levels=False, rounds=start)
+        terms = _kept(with_remainder, 0), _kept(with_remainder, 1)
+        start = start._replace(start=with_remainder.beginning(terms=terms))
+    posterior = fit(states, average_roughness=True, rounds=start)
     require_passive(free, posterior.modal_mass[0])
     if "force_gain" in free:
         posterior = _with_common_gain_in_the_force(posterior)
     noise = _noise_of(posterior, stated)
-    # What a stated noise lets the posterior have may be less than the states show.
+    # The prior of a stated noise may keep the posterior's noise below that of the residuals.
     wider = max(noise.scale / posterior.hyper.noise, 1.0) if noise.exceeded else 1.0
-    size = wider * posterior.hyper.noise / np.sqrt(posterior.fraction)
+    scale = wider * posterior.hyper.noise / np.sqrt(posterior.fraction)
     errors = np.zeros((len(states.level), len(STATE_ERRORS)))
     corrections = np.zeros_like(errors)
     n_inputs = posterior.corrections.shape[1]
     errors[:, :n_inputs], corrections[:, :n_inputs] = (
-        size * posterior.states.errors,
+        scale * posterior.states.errors,
         posterior.corrections,
     )
     new_level = np.where(
@@ -128,7 +126,7 @@ def view_of(
             std=jax.device_put(errors),
             weight=jax.device_put(posterior.weight),
             correction=jax.device_put(corrections),
-            away=jax.device_put(off_resonance(z, states.frequency)),
+            detuning=jax.device_put(off_resonance(z, states.frequency)),
         ),
         prior=dataclasses.replace(
             problem.prior,
@@ -140,17 +138,17 @@ def view_of(
 
 
 def _with_common_gain_in_the_force(posterior: TestPosterior) -> TestPosterior:
-    """The posterior with all that levels' gains have in common in the free gain of the force.
+    """The posterior with the mean of the level gains moved to the free force gain.
 
-    Both do the same to every state, and the curves stay what they are. How they share it is left
-    to priors, of which that of the curves' bends prefers small forces.
+    Both act identically on every state. The split is left to the priors, and the roughness prior
+    of the curves prefers small forces.
     """
-    places, mean = posterior.places, posterior.mean.copy()
+    layout, mean = posterior.layout, posterior.mean.copy()
     common = float(np.mean(posterior.level_errors[:, 0]))
-    mean[places.levels[:, 0]] -= common
+    mean[layout.levels[:, 0]] -= common
     mean[MASS] = (1 + mean[MASS]) * np.exp(common) - 1
     mean[OFFSET] *= np.exp(common)
-    for terms, functions in zip(posterior.terms, (places.stiffness, places.damping), strict=True):
+    for terms, functions in zip(posterior.terms, (layout.stiffness, layout.damping), strict=True):
         mean[functions] *= np.where(terms.scaled, np.exp(common), 1.0)
     return posterior._replace(mean=mean)
 
@@ -158,20 +156,20 @@ def _with_common_gain_in_the_force(posterior: TestPosterior) -> TestPosterior:
 def _test_states(
     problem: BalanceProblem, free: tuple[str, ...], stated: bool, guess: complex
 ) -> TestStates:
-    """The states as the model of a test has them, instruments as far off as was guessed."""
+    """The states for the model of a test, corrected for the initial guess of the instruments."""
     data, prior = problem.data, problem.prior
     force = abs(guess) * np.asarray(data.force)
     spread = np.asarray(prior.linear)
     others = spread[: EXPONENTS.start]
 
-    def beside(deviation: np.ndarray) -> Complex[np.ndarray, " state"]:
+    def velocity_at(deviation: np.ndarray) -> Complex[np.ndarray, " state"]:
         return velocity_of_others(problem, np.append(deviation, np.zeros(3)), force)
 
     constant = float(problem.modal_constant)
     sign = np.sign(constant)
     known = np.zeros(len(others))
-    velocity = np.asarray(data.velocity) * np.exp(-1j * np.angle(guess)) - beside(known)
-    moved = [beside(unit) - beside(known) for unit in np.eye(len(known))[others > 0]]
+    velocity = np.asarray(data.velocity) * np.exp(-1j * np.angle(guess)) - velocity_at(known)
+    moved = [velocity_at(unit) - velocity_at(known) for unit in np.eye(len(known))[others > 0]]
     return TestStates(
         level=np.asarray(data.level),
         frequency=np.asarray(data.frequency),
@@ -186,18 +184,18 @@ def _test_states(
         phase_std=_FREE if "instrument_phase" in free else 0.0,
         offset_std=_FREE if "force_offset" in free else 0.0,
         off_resonance_std=OFF_RESONANCE,
-        beside=sign * np.stack(moved, axis=1) if moved else None,
+        other_modes=sign * np.stack(moved, axis=1) if moved else None,
     )
 
 
 def viewed_unknowns(view: View) -> Unknowns:
-    """Unknowns of a joint fit at the posterior's mean."""
+    """Unknowns of a joint fit at the posterior mean."""
     posterior, prior = view.posterior, view.problem.prior
     level, spread = np.asarray(prior.level), np.asarray(prior.linear)
     mass = posterior.modal_mass[0]
     gain, is_free = abs(view.gain), "force_gain" in view.free
     linear = np.zeros(len(spread))
-    linear[np.flatnonzero(spread[: EXPONENTS.start] > 0)] = posterior.mean[posterior.places.others]
+    linear[np.flatnonzero(spread[: EXPONENTS.start] > 0)] = posterior.mean[posterior.layout.others]
     linear[EXPONENTS] = posterior.mean[WITH_FREQUENCY] / spread[EXPONENTS]
     if spread[-1] > 0:
         linear[-1] = np.log(mass) / spread[-1]
@@ -213,19 +211,19 @@ def viewed_unknowns(view: View) -> Unknowns:
 
 
 def _sign_of_gain(view: View) -> Float[np.ndarray, " error"]:
-    """A record's gain takes from it, a free gain of the force gives to it."""
+    """Sign of level errors: gains divide the recorded velocity, free ones multiply the force."""
     return np.array([-1.0 if "force_gain" in view.free else 1.0, 1.0, 1.0, 1.0])
 
 
 def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
-    """Covariance of a fit's free unknowns, in their order."""
+    """Covariance of the free unknowns of a fit."""
     posterior, prior = view.posterior, view.problem.prior
-    places, mass = posterior.places, posterior.modal_mass[0]
+    layout, mass = posterior.layout, posterior.modal_mass[0]
     n = len(posterior.mean)
 
-    def by(**places_and_slopes: float) -> np.ndarray:
+    def by(**unknowns_and_slopes: float) -> np.ndarray:
         row = np.zeros(n)
-        for name, slope in places_and_slopes.items():
+        for name, slope in unknowns_and_slopes.items():
             row[{"mass": MASS, "phase": PHASE, "offset": OFFSET}[name]] = slope
         return row
 
@@ -237,14 +235,14 @@ def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
         "instrument_phase": by(phase=1.0),
     }
     unit = _sign_of_gain(view) / np.asarray(prior.level)
-    levels = np.zeros((places.levels.size, n))
-    levels[np.arange(places.levels.size), places.levels.reshape(-1)] = np.tile(
-        unit, len(places.levels)
+    levels = np.zeros((layout.levels.size, n))
+    levels[np.arange(layout.levels.size), layout.levels.reshape(-1)] = np.tile(
+        unit, len(layout.levels)
     )
     spread = np.asarray(prior.linear)
     linear = np.zeros((len(spread), n))
     others = np.flatnonzero(spread[: EXPONENTS.start] > 0)
-    linear[others, np.arange(n)[places.others]] = 1.0
+    linear[others, np.arange(n)[layout.others]] = 1.0
     linear[EXPONENTS, WITH_FREQUENCY] = np.diag(1 / spread[EXPONENTS])
     if spread[-1] > 0:
         linear[-1] = by(mass=1 / (mass * spread[-1]))
@@ -252,23 +250,23 @@ def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
     rows += [row[None] for name, row in measurement.items() if name in view.free]
     slopes = np.concatenate([*rows, levels, linear])
     covariance = slopes @ posterior.covariance @ slopes.T
-    # What is known for certain is as far off, in its own 1σ, as its prior says.
+    # Parameters without uncertainty keep their prior: unit variance in their own 1σ.
     certain = len(covariance) - len(spread) + np.flatnonzero(spread == 0)
     covariance[certain, certain] = 1.0
     return covariance
 
 
 def _noise_of(posterior: TestPosterior, stated: bool) -> NoiseEstimate:
-    """The noise as the residuals have it, and 1σ of what levels share as the posterior has them."""
+    """The noise from the residuals, and the posterior's 1σ of level errors."""
     rows = posterior.residuals.size
-    left = max(rows - posterior.effective_unknowns, LEAST_LEFT * rows)
-    noise = posterior.hyper.noise * float(np.sqrt(np.sum(posterior.residuals**2) / left))
-    std = noise / np.sqrt(2 * posterior.fraction * left)
+    freedom = max(rows - posterior.effective_unknowns, LEAST_LEFT * rows)
+    noise = posterior.hyper.noise * float(np.sqrt(np.sum(posterior.residuals**2) / freedom))
+    std = noise / np.sqrt(2 * posterior.fraction * freedom)
     return NoiseEstimate(noise, std, np.array(posterior.hyper.level_std), stated)
 
 
 def _terms(posterior: TestPosterior, choices: tuple[Choice, Choice], which: int) -> CurveTerms:
-    """The terms of a curve as they were asked for, near what the smooth posterior has."""
+    """The terms of the chosen family, starting near the smooth posterior."""
     terms, choice = posterior.terms[which], choices[which]
     family = None
     if choice.kind not in SMOOTH:
@@ -283,36 +281,36 @@ def _terms(posterior: TestPosterior, choices: tuple[Choice, Choice], which: int)
     return CurveTerms(basis, terms.unit, argument, family)
 
 
-def _kept(whole: TestPosterior, which: int) -> CurveTerms:
-    """The terms of a curve, of which a family leaves no remainder that noise explains."""
-    terms = whole.terms[which]
+def _kept(with_remainder: TestPosterior, which: int) -> CurveTerms:
+    """The terms of a curve, a family without remainder where noise explains it."""
+    terms = with_remainder.terms[which]
     if terms.family is None:
         return terms
-    family = terms.family.at(_parameters(whole, which)[: terms.n_own])
-    return terms._replace(family=family, smooth=whole.remainders[which])
+    family = terms.family.at(_parameters(with_remainder, which)[: terms.n_own])
+    return terms._replace(family=family, smooth=with_remainder.remainders[which])
 
 
 def _nearest(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
-    """A member of the family asked for, near the smooth curve."""
+    """The simplest member of the family within the band of the smooth curve, else the nearest."""
     x = posterior.states.amplitude
     curves = posterior.curves(x)
     values = (curves.squared_frequency, curves.modal_damping)[which]
     std = np.sqrt(curves.covariance[:, which, which])
     family, n = FAMILIES[choice.kind], len(x)
-    sizes = family.orders if choice.size is None else (choice.size,)
+    orders = family.orders if choice.size is None else (choice.size,)
     tried: list[tuple[float, int, AbstractFamily]] = []
-    for size in sizes:
+    for order in orders:
         for argument in (choice.argument,) if choice.argument else ARGUMENTS:
             at = x if argument == "displacement" else np.abs(posterior.states.velocity)
-            for member in family.starts(size, Scattered(argument, at, values, 1 / std)):
+            for member in family.starts(order, Scattered(argument, at, values, 1 / std)):
                 if member.parameters.shape[0] >= n:
                     raise ValueError(
-                        f"{choice.kind}:{size} has {member.parameters.shape[0]} parameters, but "
-                        f"there are {n} states only: choose a smaller family."
+                        f"{choice.kind}:{order} has {member.parameters.shape[0]} parameters, but "
+                        f"there are only {n} states: choose a smaller family."
                     )
-                off = np.sqrt(np.mean(((member.linearised(at).value - values) / std) ** 2))
-                tried.append((float(off), member.parameters.shape[0], member))
-    # The simplest that lies in the band of the smooth curve, or else the nearest to it.
+                misfit = np.sqrt(np.mean(((member.linearised(at).value - values) / std) ** 2))
+                tried.append((float(misfit), member.parameters.shape[0], member))
+    # Within the band: rms misfit below 1σ.
     inside = [row for row in tried if row[0] < 1.0]
     if inside:
         return min(inside, key=lambda row: (row[1], row[0]))[2]
@@ -320,8 +318,8 @@ def _nearest(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFa
 
 
 def _of_curve(posterior: TestPosterior, which: int) -> tuple[CurveTerms, slice]:
-    places = posterior.places
-    return posterior.terms[which], (places.stiffness, places.damping)[which]
+    layout = posterior.layout
+    return posterior.terms[which], (layout.stiffness, layout.damping)[which]
 
 
 def _parameters(posterior: TestPosterior, which: int) -> Float[np.ndarray, " parameter"]:
@@ -330,7 +328,7 @@ def _parameters(posterior: TestPosterior, which: int) -> Float[np.ndarray, " par
     own, mass = posterior.mean[functions], posterior.modal_mass[0]
     if terms.family is not None:
         return terms.units * own / np.where(terms.scaled, mass, 1.0)
-    reference = posterior.places.reference if which == 0 else 0.0
+    reference = posterior.layout.reference if which == 0 else 0.0
     return terms.curve(terms.basis.largest * np.sqrt(terms.basis.knots), own)[0] / mass + reference
 
 
@@ -350,11 +348,11 @@ def _slopes(posterior: TestPosterior, which: int) -> Float[np.ndarray, "paramete
 
 
 def _curve(posterior: TestPosterior, which: int) -> AbstractFamily:
-    """A curve as the posterior has it: its smooth functions are of the sizes that it found."""
+    """A curve of the posterior, with its estimated roughness as prior."""
     terms, hyper = posterior.terms[which], posterior.hyper
     basis, parameters = terms.basis, _parameters(posterior, which)
-    size = terms.unit * hyper.roughness[which] / posterior.modal_mass[0]
-    roughness = size * np.exp(basis.directions @ hyper.along)
+    roughness_std = terms.unit * hyper.roughness[which] / posterior.modal_mass[0]
+    roughness = roughness_std * np.exp(basis.directions @ hyper.along)
     if terms.family is None:
         scale = jax.device_put(basis.largest)
         return SmoothingSpline.through(basis.knots, parameters, scale, terms.argument, roughness)
@@ -363,14 +361,14 @@ def _curve(posterior: TestPosterior, which: int) -> AbstractFamily:
     if not terms.smooth:
         return family
     functions = basis.values(basis.largest * np.sqrt(basis.knots))[0][:, 1:]
-    std = np.append(size * basis.reach, roughness)
+    std = np.append(roughness_std * basis.reach, roughness)
     return WithRemainder.of(family, basis.knots, functions, parameters[n:], std)
 
 
 def _complex_gain(problem: BalanceProblem) -> complex:
     """G of K X/A = G F with K polynomial in the amplitude, by linear least squares.
 
-    Where these make the damping negative, the phase is that of a passive structure, to 180°.
+    Where that gives negative damping, a real G with the sign of a passive structure is fitted.
     """
     data, constant = problem.data, float(problem.modal_constant)
     omega, velocity, force = (
@@ -384,17 +382,17 @@ def _complex_gain(problem: BalanceProblem) -> complex:
     matrix = np.stack([np.concatenate([c.real, c.imag]) for c in columns], axis=1)
     target = np.concatenate([right.real, right.imag])
     weight = np.tile(1.0 / np.maximum(np.abs(x), 1e-300), 2)
-    size = np.linalg.norm(matrix * weight[:, None], axis=0)
-    weighted, goal = matrix * weight[:, None] / size, target * weight
+    norm = np.linalg.norm(matrix * weight[:, None], axis=0)
+    weighted, goal = matrix * weight[:, None] / norm, target * weight
     answer = np.linalg.lstsq(weighted, goal, rcond=1e-13)[0]
-    gain = complex(*(answer / size)[6:])
-    damping = np.stack([np.ones_like(a), a, a**2], axis=1) @ (answer / size)[3:6]
+    gain = complex(*(answer / norm)[6:])
+    damping = np.stack([np.ones_like(a), a, a**2], axis=1) @ (answer / norm)[3:6]
     if gain != 0 and np.median(damping) > 0:
         return gain
-    # Turned by 180° states of one side of resonance are fitted as well, with damping below zero.
-    # The power that the force gives a passive structure has the sign of its gain.
+    # States on one side of resonance are fitted as well with a phase of 180° and negative damping.
+    # The power input to a passive structure is positive: it gives the sign of the gain.
     sign = np.sign(np.sum(np.sign(np.real(velocity * constant)))) or 1.0
     weighted[:, 6] *= sign
     answer = np.append(nnls(weighted[:, :7], goal)[0], 0.0)
-    gain = sign * float((answer / size)[6])
+    gain = sign * float((answer / norm)[6])
     return complex(gain if gain != 0 else sign)

@@ -1,4 +1,4 @@
-"""Modes of low-level tests that already depend on the amplitude: their values at no amplitude."""
+"""Amplitude-dependent modes of low-level tests, extrapolated to zero amplitude."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -31,15 +31,14 @@ from snrmjax.model.moving_base import SensorMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
-# Powers of the amplitude, of hysteresis and of smooth symmetric forces; of stiffness alone, and of
-# damping too.
+# (power of the amplitude, damping too): 1 for hysteresis, 2 for smooth symmetric forces.
 _KINDS = tuple(product((1, 2), (False, True)))
-_CHI_SQUARE = 5.99  # of two numbers at 95 %
-_REGION = 10.0  # half-power bandwidths about a mode, of the states from which a fit starts
+_CHI_SQUARE = 5.99  # 95 % quantile for two degrees of freedom
+_REGION = 10.0  # half-power bandwidths about a mode, whose states give the starting values
 
 
 class LevelRows(NamedTuple):
-    """All states of some levels as rows of one fit, level after level."""
+    """All states of given levels as rows of one fit, level after level."""
 
     data: ResponseData
     level: np.ndarray  # (row,)
@@ -55,17 +54,17 @@ class _Candidate(NamedTuple):
 
     @property
     def criterion(self) -> float:
-        """Bayes' information criterion, for residuals that are white.
+        """Bayesian information criterion, for white residuals.
 
-        No dependence is as probable beforehand as all kinds of it together.
+        No dependence has the same prior probability as all kinds of dependence together.
         """
         kinds = 1 if self.settings.dependence is None else len(_KINDS)
-        size = self.fit.residuals.size
-        return self.deviance + self.n_unknowns * float(np.log(size)) + 2 * float(np.log(kinds))
+        n_data = self.fit.residuals.size
+        return self.deviance + self.n_unknowns * float(np.log(n_data)) + 2 * float(np.log(kinds))
 
     @property
     def white(self) -> bool:
-        """Whether neighbouring residuals are as independent as errors are: nothing is left."""
+        """Whether neighbouring residuals are uncorrelated: no systematic misfit."""
         return not self.fit.correlation.size
 
 
@@ -76,41 +75,41 @@ def amplitude_dependent_modes(
     residual_terms: ResidualTerms = "auto",
     instrument_phase: bool = False,
 ) -> tuple[LinearModalFit, Fact] | None:
-    """The modes at no amplitude where a joint fit of levels shows that one depends on it.
+    """The modes at zero amplitude, where a joint fit of levels shows a dependence on it.
 
     The mode that responds most obeys (ω² − Ω² + 2iζωΩ + (α + iβΩ)|q|^p) q = F with p = 1 or 2 and
-    with β or without; all else is linear. Fits with and without α are compared by Bayes'
-    information criterion. From the lowest level upward levels count as long as the best fit leaves
-    nothing but errors (neighbouring residuals are not correlated) and the next level asks for no
-    frequency and damping of its own. What the other candidates say, with their weights, widens the
+    with β or without; all else is linear. Fits with and without α are compared by the
+    Bayesian information criterion. Levels are added from the lowest upward as long as the best fit
+    has white residuals (neighbouring ones are not correlated) and the next level needs no frequency
+    and damping of its own. The spread of the other candidates, with their weights, widens the
     errors.
 
     Arguments: `start` of the lowest level; further as `fit_linear_modes`.
-    Returns the fit and what it says, or None where no dependence shows, or where what the lowest
-    level shows does not hold at the next.
+    Returns the fit and a `Fact` on the dependence, or None without a significant dependence or
+    where that of the lowest level does not hold at the next.
     Validity: one mode that depends on its amplitude, small changes of stiffness and damping, and
     one solution near each state.
     """
     levels = list(dict.fromkeys(rows.level.tolist()))
     best: tuple[LevelRows, list[_Candidate]] | None = None
-    before: list[_Candidate] = []  # the best of fewer levels
+    before: list[_Candidate] = []  # the best fits of fewer levels
     for count in range(1, len(levels) + 1):
         part = _levels(rows, levels[:count])
         settings = basis_settings(part.data, residual_terms, instrument_phase, None)
-        found = _candidates(part, settings, start)
-        if not (found and found[0].white):
+        candidates = _candidates(part, settings, start)
+        if not (candidates and candidates[0].white):
             break
-        if best is not None and _apart(part, found, levels[count - 1]):
+        if best is not None and _apart(part, candidates, levels[count - 1]):
             break
         before += [] if best is None else [best[1][0]]
-        best = part, found
+        best = part, candidates
     if best is None:
         return None
-    part, found = best
+    part, candidates = best
     if len(levels) > 1 and len(set(part.level.tolist())) == 1:
         return None
-    of = found[0].settings.dependence
-    return None if of is None else _told(part, found, of, start, before)
+    of = candidates[0].settings.dependence
+    return None if of is None else _result(part, candidates, of, start, before)
 
 
 def rows_of_levels(
@@ -122,10 +121,10 @@ def rows_of_levels(
 ) -> LevelRows:
     """The states of levels, in this order and by frequency, as receptances with their errors.
 
-    A level with phases that were not measured is left out.
+    Levels with unmeasured phases are left out.
 
-    Arguments: `base` what the sensors record of a moving base, whose own motion is taken away;
-    `band` in rad/s, open where None.
+    Arguments: `base` states what the sensors record on a moving base, whose own motion is
+    subtracted; `band` in rad/s, open where None.
     """
     level, omega = np.asarray(data.level), np.asarray(data.frequency)
     low, high = (
@@ -133,17 +132,19 @@ def rows_of_levels(
     )
     unknown = np.unique(level[np.asarray(data.phase_unknown).reshape(len(level), -1).any(axis=1)])
     inside = (omega >= low * (1 - 1e-12)) & (omega <= high * (1 + 1e-12))
-    place = {number: k for k, number in enumerate(levels) if number not in unknown}
-    keep = np.flatnonzero(inside & np.isin(level, list(place)))
-    places = np.array([place[number] for number in level[keep].tolist()])
-    order = keep[np.lexsort((omega[keep], places))]
+    rank = {number: k for k, number in enumerate(levels) if number not in unknown}
+    keep = np.flatnonzero(inside & np.isin(level, list(rank)))
+    ranks = np.array([rank[number] for number in level[keep].tolist()])
+    order = keep[np.lexsort((omega[keep], ranks))]
     reference, load, velocity, std, known = over_reference(data, order)
-    turn = 1j * omega[order, None] * load[:, None]
-    receptance = velocity / turn + (omega[order, None] ** -2.0 if base == "absolute" else 0.0)
+    per_receptance = 1j * omega[order, None] * load[:, None]
+    receptance = velocity / per_receptance + (
+        omega[order, None] ** -2.0 if base == "absolute" else 0.0
+    )
     given = ResponseData(
         omega=omega[order],
         receptance=receptance.T,
-        std=(std / np.abs(turn)).T if known else np.full(receptance.T.shape, np.nan),
+        std=(std / np.abs(per_receptance)).T if known else np.full(receptance.T.shape, np.nan),
         powers=(1,) * len(data.sensors),
         channels=tuple(Channel(name, "velocity", "m/s") for name in data.sensors),
         reference=reference,
@@ -158,8 +159,8 @@ def rows_of_levels(
 def over_reference(
     data: SteadyStates, rows: np.ndarray
 ) -> tuple[Channel, np.ndarray, np.ndarray, np.ndarray, bool]:
-    """Some rows: their reference and its load (N, V, m/s²), velocities (NaN where not measured),
-    1σ of real and of imaginary part, and whether all of these are stated.
+    """Selected rows: reference, its load (N, V, m/s²), velocities (NaN where not measured), 1σ of
+    real and of imaginary part, and whether all 1σ are stated.
     """
     load = np.asarray(data.force)[rows]
     reference = Channel("force", "force", "N")
@@ -167,26 +168,26 @@ def over_reference(
         load, reference = np.asarray(data.drive)[rows], Channel("drive", "voltage", "V")
     if data.base is not None:
         reference = Channel("base", "acceleration", "m/s^2")
-    seen = np.asarray(data.measured)[rows]
-    velocity = np.where(seen, np.asarray(data.velocity)[rows], np.nan)
+    measured = np.asarray(data.measured)[rows]
+    velocity = np.where(measured, np.asarray(data.velocity)[rows], np.nan)
     errors = np.asarray(relative_errors(data))[rows]
     std = np.sqrt(np.nansum(errors**2, axis=2) / 2) * np.abs(velocity)
     stated = np.isfinite(errors).all(axis=2) & (std > 0)
-    return reference, load, velocity, std, bool(np.all(stated[seen]))
+    return reference, load, velocity, std, bool(np.all(stated[measured]))
 
 
 def pole_of_states(rows: LevelRows) -> float | None:
     """Natural frequency (rad/s) of one mode at the lowest level, by linear least squares.
 
-    None where they find no damped mode.
+    None where the fit has no damped mode.
     """
     data = _levels(rows, rows.level[:1].tolist()).data
     if not data.omega.size:
         return None
-    size = np.where(np.isfinite(data.receptance), np.abs(data.receptance), 0.0) * data.load
-    sensor, top = np.unravel_index(np.argmax(size), size.shape)
-    found = _regressed(data, int(sensor), (float(data.omega[top]), np.inf), 2, False)
-    return None if found is None else float(found[0])
+    amplitude = np.where(np.isfinite(data.receptance), np.abs(data.receptance), 0.0) * data.load
+    sensor, top = np.unravel_index(np.argmax(amplitude), amplitude.shape)
+    values = _regressed(data, int(sensor), (float(data.omega[top]), np.inf), 2, False)
+    return None if values is None else float(values[0])
 
 
 def _levels(rows: LevelRows, levels: Sequence[int]) -> LevelRows:
@@ -208,16 +209,16 @@ def _candidates(
     rows: LevelRows, settings: BasisSettings, start: LinearModalFit
 ) -> list[_Candidate]:
     """Fits of all kinds of dependence and of none, the most probable first."""
-    found = []
+    candidates = []
     poles = np.concatenate([start.natural_frequency, start.damping_ratio])
-    size = np.max(np.abs(start.residue), axis=0)
-    mode = int(np.argmax(size / (start.damping_ratio * start.natural_frequency**2)))
+    residue = np.max(np.abs(start.residue), axis=0)
+    mode = int(np.argmax(residue / (start.damping_ratio * start.natural_frequency**2)))
     linear = _fitted(rows, settings, [poles])
     if linear is not None:
-        found.append(linear)
+        candidates.append(linear)
     for power, damping in _KINDS:
-        found += _of_kind(rows, settings, (poles, mode, start), power, damping)
-    return sorted(found, key=lambda one: one.criterion)
+        candidates += _of_kind(rows, settings, (poles, mode, start), power, damping)
+    return sorted(candidates, key=lambda one: one.criterion)
 
 
 def _of_kind(
@@ -227,10 +228,10 @@ def _of_kind(
     power: int,
     damping: bool,
 ) -> Iterator[_Candidate]:
-    """Fits with one kind of dependence, of all modes and without those that stand for a skew.
+    """Fits with one kind of dependence, of all modes and without spurious ones.
 
-    A resonance that leans is fitted by two linear modes: the mode nearest to the one that depends
-    on its amplitude is left out as long as that is the more probable.
+    Two linear modes can fit a skewed resonance: the mode nearest to the amplitude-dependent one is
+    left out as long as that lowers the criterion.
     """
     poles, mode, start = of
     best: _Candidate | None = None
@@ -251,8 +252,8 @@ def _of_kind(
         best = one
         if n == 1:
             break
-        away = np.abs(poles[:n] - poles[mode])
-        nearest = int(np.argsort(away)[1])
+        distance = np.abs(poles[:n] - poles[mode])
+        nearest = int(np.argsort(distance)[1])
         poles = np.delete(poles, [nearest, n + nearest])
         mode -= nearest < mode
     if best is not None:
@@ -262,7 +263,7 @@ def _of_kind(
 def _start(
     rows: LevelRows, mode: tuple[float, float], start: LinearModalFit, power: int, damping: bool
 ) -> tuple[AmplitudeDependence, np.ndarray | None]:
-    """The dependence with the amplitudes as measured; and ω, ζ, s, t by linear least squares.
+    """The dependence at the measured amplitudes; and ω, ζ, s, t by linear least squares.
 
     Ω²x = ω²x + icΩx + α|x|^p x + iβΩ|x|^p x − PF at the sensor that moves most.
     """
@@ -270,8 +271,8 @@ def _start(
     nearest = int(np.argmin(np.abs(start.natural_frequency - natural)))
     sensor = int(np.argmax(np.abs(start.residue[:, nearest])))
     x = data.receptance[sensor] * data.load
-    seen = np.isfinite(x)
-    x = np.where(seen, x, np.nanmin(np.abs(x)))
+    measured = np.isfinite(x)
+    x = np.where(measured, x, np.nanmin(np.abs(x)))
     near = np.abs(x) / np.abs(start.residue[sensor, nearest])
     dependence = AmplitudeDependence(0, power, damping, natural, np.asarray(data.load), near)
     return dependence, _regressed(data, sensor, (natural, ratio), power, damping)
@@ -280,34 +281,34 @@ def _start(
 def _regressed(
     data: ResponseData, sensor: int, mode: tuple[float, float], power: int, damping: bool
 ) -> np.ndarray | None:
-    """ω, ζ, s, t where asked for, and P by linear least squares at states about a mode."""
+    """ω, ζ, s, t (if requested) and P by linear least squares at states about a mode."""
     natural, ratio = mode
     x = data.receptance[sensor] * data.load
-    seen = np.isfinite(x)
-    x = np.where(seen, x, 0.0)
+    measured = np.isfinite(x)
+    x = np.where(measured, x, 0.0)
     load, omega = np.asarray(data.load), data.omega
     fraction = (np.abs(x) / np.abs(x).max()) ** power
-    use = seen & (np.abs(omega - natural) < _REGION * 2 * ratio * natural)
+    use = measured & (np.abs(omega - natural) < _REGION * 2 * ratio * natural)
     columns = [x, 1j * omega * x, natural**2 * fraction * x]
     columns += [1j * natural * omega * fraction * x] * damping
     table = np.stack([*columns, -load], axis=1)[use]
     goal = (omega**2 * x)[use]
-    both, wanted = np.concatenate([table.real, table.imag]), np.append(goal.real, goal.imag)
-    if len(wanted) <= both.shape[1]:
+    both, target = np.concatenate([table.real, table.imag]), np.append(goal.real, goal.imag)
+    if len(target) <= both.shape[1]:
         return None
     scale = np.maximum(np.linalg.norm(both, axis=0), 1e-300)
-    found = np.linalg.lstsq(both / scale, wanted, rcond=None)[0] / scale
-    if not (found[0] > 0 and found[1] > 0):
+    solution = np.linalg.lstsq(both / scale, target, rcond=None)[0] / scale
+    if not (solution[0] > 0 and solution[1] > 0):
         return None
-    own = np.sqrt(found[0])
-    return np.array([own, found[1] / (2 * own), *found[2:]])
+    own = np.sqrt(solution[0])
+    return np.array([own, solution[1] / (2 * own), *solution[2:]])
 
 
 def _fitted(
     rows: LevelRows, settings: BasisSettings, starts: Sequence[np.ndarray]
 ) -> _Candidate | None:
-    """The best fit from several starts; None where none ends at modes with positive damping."""
-    data, found = rows.data, []
+    """The best fit from several starts; None if none has positive damping of all modes."""
+    data, candidates = rows.data, []
     std = 1 / np.maximum(line_weights(data), 1e-300)
     for start in starts:
         unknowns = np.append(start, np.zeros(int(settings.phase)))
@@ -317,16 +318,16 @@ def _fitted(
         fit, spread = weighted_fit(data, settings, unknowns, std)
         if np.all(unpacked(fit.unknowns, settings)[1] > 0) and np.isfinite(fit.residuals).all():
             good = np.isfinite(data.receptance)
-            of_size = 4 * np.sum(np.log(spread.std[good]))
-            deviance = float(np.sum(fit.residuals**2) + of_size)
+            log_determinant = 4 * np.sum(np.log(spread.std[good]))
+            deviance = float(np.sum(fit.residuals**2) + log_determinant)
             n = len(fit.unknowns) + fit.coefficients.size
-            found.append(_Candidate(settings, fit, spread, deviance, n))
-    return min(found, key=lambda one: one.deviance, default=None)
+            candidates.append(_Candidate(settings, fit, spread, deviance, n))
+    return min(candidates, key=lambda one: one.deviance, default=None)
 
 
-def _apart(rows: LevelRows, found: Sequence[_Candidate], level: int) -> bool:
-    """Whether the states of a level ask for a frequency and a damping of their own."""
-    dependent = [one for one in found if one.settings.dependence is not None]
+def _apart(rows: LevelRows, candidates: Sequence[_Candidate], level: int) -> bool:
+    """Whether the states of a level need a frequency and a damping of their own."""
+    dependent = [one for one in candidates if one.settings.dependence is not None]
     if not dependent:
         return True
     best = dependent[0]
@@ -345,56 +346,56 @@ def _apart(rows: LevelRows, found: Sequence[_Candidate], level: int) -> bool:
 def _drift(
     before: Sequence[_Candidate], mode: tuple[float, float, Float[np.ndarray, " sensor"]]
 ) -> Float[np.ndarray, "entry entry"]:
-    """The largest square by which ω, ζ and residues moved since a fit of fewer levels.
+    """Outer product of the largest change of ω, ζ and residues since a fit of fewer levels.
 
-    Where ω and ζ did by more than the 95 % of that fit's own errors; else nothing.
+    Only where ω and ζ left the 95 % region of that fit; zero otherwise.
     """
     natural, ratio, residue = mode
-    moved, farthest = np.zeros((2 + len(residue),) * 2), _CHI_SQUARE
+    moved, largest = np.zeros((2 + len(residue),) * 2), _CHI_SQUARE
     for one in before:
         w, z, _ = unpacked(one.fit.unknowns, one.settings)
         nearest = int(np.argmin(np.abs(w - natural)))
         rows = np.array([nearest, len(w) + nearest])
         own = one.fit.covariance[np.ix_(rows, rows)]
-        away = np.array([w[nearest] - natural, z[nearest] - ratio])
-        apart = float(away @ np.linalg.solve(own, away))
-        if apart > farthest:
-            whole = np.concatenate([away, one.fit.coefficients[:, nearest] - residue])
-            moved, farthest = np.outer(whole, whole), apart
+        distance = np.array([w[nearest] - natural, z[nearest] - ratio])
+        apart = float(distance @ np.linalg.solve(own, distance))
+        if apart > largest:
+            whole = np.concatenate([distance, one.fit.coefficients[:, nearest] - residue])
+            moved, largest = np.outer(whole, whole), apart
     return moved
 
 
-def _told(
+def _result(
     rows: LevelRows,
-    found: Sequence[_Candidate],
+    candidates: Sequence[_Candidate],
     of: AmplitudeDependence,
     start: LinearModalFit,
     before: Sequence[_Candidate],
 ) -> tuple[LinearModalFit, Fact]:
-    """The fit of the best candidate, with what the others say in its errors.
+    """The fit of the best candidate, its errors widened by the spread of the others.
 
-    Also those of fewer levels (`before`): where the values at no amplitude move with every further
-    level by more than their own errors, a power of the amplitude is not all that the mode does.
+    Also by fits of fewer levels (`before`): if the values at zero amplitude change with further
+    levels by more than their errors, a power of the amplitude is not the full dependence.
     """
-    best = found[0]
+    best = candidates[0]
     modes = modal_result(rows.data, best.settings, best.fit, best.spread, start.orders)
     natural, ratio, _ = unpacked(best.fit.unknowns, best.settings)
     n, k = len(natural), of.mode
-    place = int(np.argsort(np.argsort(natural))[k])
-    weights = np.array([one.criterion for one in found])
+    rank = int(np.argsort(np.argsort(natural))[k])
+    weights = np.array([one.criterion for one in candidates])
     weights = np.exp(-0.5 * (weights - weights.min()))
     covariance = modes.mode_covariance.copy()
-    for one, weight in zip(found, weights / weights.sum(), strict=True):
+    for one, weight in zip(candidates, weights / weights.sum(), strict=True):
         w, z, _ = unpacked(one.fit.unknowns, one.settings)
         nearest = int(np.argmin(np.abs(w - natural[k])))
-        away = np.array([w[nearest] - natural[k], z[nearest] - ratio[k]])
-        covariance[place, :2, :2] += weight * np.outer(away, away)
-    covariance[place] += _drift(before, (natural[k], ratio[k], best.fit.coefficients[:, k]))
+        distance = np.array([w[nearest] - natural[k], z[nearest] - ratio[k]])
+        covariance[rank, :2, :2] += weight * np.outer(distance, distance)
+    covariance[rank] += _drift(before, (natural[k], ratio[k], best.fit.coefficients[:, k]))
     change, loss = best.fit.unknowns[2 * n], best.fit.unknowns[2 * n + 1] if of.damping else 0.0
     column = receptance_bases(rows.data.omega, best.fit.unknowns, best.settings)[0].columns[:, k]
     half = len(column) // 2
-    size = np.abs(column[:half] + 1j * column[half:]) * rows.data.load
-    fraction = (size / of.near.max()) ** of.power
+    amplitude = np.abs(column[:half] + 1j * column[half:]) * rows.data.load
+    fraction = (amplitude / of.near.max()) ** of.power
     ends = np.sqrt(natural[k] ** 2 + of.unit**2 * change * np.array([fraction.max(), 0.0]))
     shift = float(ends[0] - ends[1])
     error = best.fit.covariance[2 * n, 2 * n] ** 0.5 * abs(shift / change) if change else np.inf
@@ -408,7 +409,7 @@ def _told(
     )
     fact = Fact(
         "amplitude_dependent_mode",
-        mode=place + 1,
+        mode=rank + 1,
         frequency_hz=float(natural[k]) / HERTZ,
         power=of.power,
         shift_hz=shift / HERTZ,

@@ -1,10 +1,10 @@
 """Decaying oscillations whose rates may depend on an amplitude, as columns of a separable fit.
 
-A linear mode decays as e^{(−ζω + iω_d) t}. In a mode whose rates move with its own amplitude
-A = e^u, one at the first sample, du/dt = −d(A) and dφ/dt = w(A) with d = ζω + Σ d_j A^{p_j} and
+A linear mode decays as e^{(−ζω + iω_d) t}. If its rates depend on its amplitude
+A = e^u, A = 1 at the first sample, du/dt = −d(A) and dφ/dt = w(A) with d = ζω + Σ d_j A^{p_j} and
 w = ω_d + Σ w_j A^{p_j}: cubic and quintic forces have p = 2 and 4, damping by v|v| has p = 1, dry
 friction p = −1. Time and phase are then quadratures over u, t = ∫ du/d and φ = ∫ w/d du. Harmonics
-of such a mode are columns A^p e^{ihφ} of their own.
+of such a mode are additional columns A^p e^{ihφ}.
 Reference: Feldman, Mech. Syst. Signal Process. 25 (2011) 735, doi:10.1016/j.ymssp.2010.07.018.
 Modes are fitted to records by least squares one after another, the strongest first.
 """
@@ -26,30 +26,30 @@ from snrmjax.identify.modal.separable_fit import (
 )
 
 _NODES = 401  # of the logarithm of the amplitude
-_SLOWEST = 1e-3  # decay rate over the largest one: less is a motion that goes on for ever
-_DEEPEST = 60.0  # fall of that logarithm, beyond which nothing is left
+_SLOWEST = 1e-3  # decay rate over the largest one, below which the motion would not decay
+_DEEPEST = 60.0  # largest decrease of that logarithm
 HARMONICS = ((0, 2), (2, 2), (3, 3), (3, 5), (4, 4), (5, 5), (5, 7), (1, 3))
-"""Orders and powers of the amplitude: what quadratic, cubic and quintic forces make first.
+"""Orders and powers of the amplitude: leading terms of quadratic, cubic and quintic forces.
 
-The last is the shape of a mode that moves with the amplitude, where there are several channels.
+The last is an amplitude-dependent mode shape, for several channels only.
 """
 _MOST_DAMPED = 0.5
-_MOST_GROWTH = 3.0  # of a mode's logarithm over the record
-_MOST_MOVED = 0.5  # of ω_d, by every power of the amplitude
-_MOST_SHIFT = 0.2  # of ω, above its value at no amplitude, that a harmonic is looked for at
-_LEAST_DAMPED = 1e-5  # of a start
-_ROUNDS = 3  # of weights by the residuals of the fit before
+_MOST_GROWTH = 3.0  # of a mode's log amplitude over the record
+_MOST_MOVED = 0.5  # of ω_d, per power of the amplitude
+_MOST_SHIFT = 0.2  # of ω, above its value at zero amplitude, for the frequency of a harmonic
+_LEAST_DAMPED = 1e-5  # of starting values
+_ROUNDS = 3  # of weights from the residuals of the previous fit
 _MOST_MODES = 12
 _STEPS = 30
-_SETTLED = 1e-3  # of the sum of squares: 0.03 of a standard error
-_NEW = 1e-4  # of a wave, that the modes there are cannot follow: less is no mode of its own
+_SETTLED = 1e-3  # of the sum of squares: 0.03 standard errors
+_NEW = 1e-4  # of a wave outside the space of the present modes, below which it is no separate mode
 
 
 class WaveForm(NamedTuple):
-    """What the unknowns are: ω and ζ of every mode, then all d_j and all w_j."""
+    """Layout of the unknowns: ω and ζ of every mode, then all d_j and all w_j."""
 
     n_modes: int
-    leading: int = 0  # the mode whose rates move with its amplitude, where there are powers
+    leading: int = 0  # the mode whose rates depend on its amplitude, if there are powers
     powers: tuple[int, ...] = ()
     harmonics: tuple[tuple[int, int], ...] = ()  # of the leading mode: order, power
 
@@ -59,17 +59,17 @@ class _Flow(NamedTuple):
 
     log_amplitude: Float[np.ndarray, " sample"]
     phase: Float[np.ndarray, " sample"]
-    log_by: Float[np.ndarray, "rate sample"]  # by d_0, d_j, then w_0, w_j
+    log_by: Float[np.ndarray, "rate sample"]  # with respect to d_0, d_j, then w_0, w_j
     phase_by: Float[np.ndarray, "rate sample"]
 
 
 def decaying_columns(
     time: Float[np.ndarray, " sample"], unknowns: Float[np.ndarray, " unknown"], form: WaveForm
 ) -> TermColumns:
-    """Columns Re and −Im of every mode's wave, an offset, then harmonics; not finite where a mode
-    would not decay.
+    """Columns Re and −Im of every mode's wave, an offset, then harmonics; not finite if a mode does
+    not decay.
     """
-    n, moving = form.n_modes, len(form.powers)
+    n, n_powers = form.n_modes, len(form.powers)
     omega, ratio = unknowns[:n], unknowns[n : 2 * n]
     root = np.sqrt(1 - ratio**2)
     pole = -ratio * omega + 1j * omega * root
@@ -78,31 +78,31 @@ def decaying_columns(
     at = np.arange(n)
     slopes[at, :, at] = (time[:, None] * wave * (pole / omega)).T
     slopes[n + at, :, at] = (time[:, None] * wave * (-omega - 1j * omega * ratio / root)).T
-    if moving or form.harmonics:
+    if n_powers or form.harmonics:
         k = form.leading
         flow = _flow(time, pole[k], unknowns[2 * n :], form.powers)
-        # Of d_0 = ζω and w_0 = ω√(1 − ζ²) by ω and ζ.
-        chain = np.zeros((2 + 2 * moving, 2 + 2 * moving))
-        chain[0, 0], chain[0, 1 + moving] = ratio[k], root[k]
-        chain[1, 0], chain[1, 1 + moving] = omega[k], -omega[k] * ratio[k] / root[k]
-        chain[2 : 2 + moving, 1 : 1 + moving] = np.eye(moving)
-        chain[2 + moving :, 2 + moving :] = np.eye(moving)
+        # Derivatives of d_0 = ζω and w_0 = ω√(1 − ζ²) with respect to ω and ζ.
+        chain = np.zeros((2 + 2 * n_powers, 2 + 2 * n_powers))
+        chain[0, 0], chain[0, 1 + n_powers] = ratio[k], root[k]
+        chain[1, 0], chain[1, 1 + n_powers] = omega[k], -omega[k] * ratio[k] / root[k]
+        chain[2 : 2 + n_powers, 1 : 1 + n_powers] = np.eye(n_powers)
+        chain[2 + n_powers :, 2 + n_powers :] = np.eye(n_powers)
         log_by, phase_by = chain @ flow.log_by, chain @ flow.phase_by
         rows = np.concatenate([[k, n + k], np.arange(2 * n, len(unknowns))])
 
-        falling, turning = np.exp(flow.log_amplitude), np.exp(1j * flow.phase)
+        amplitude, rotation = np.exp(flow.log_amplitude), np.exp(1j * flow.phase)
 
-        def turned(order: int, power: int) -> tuple[np.ndarray, np.ndarray]:
-            column = falling**power * turning**order
+        def harmonic_column(order: int, power: int) -> tuple[np.ndarray, np.ndarray]:
+            column = amplitude**power * rotation**order
             by = np.zeros((len(unknowns), len(time)), dtype=complex)
             by[rows] = (power * log_by + 1j * order * phase_by) * column
             return column, by
 
-        wave[:, k], slopes[:, :, k] = turned(1, 1)
+        wave[:, k], slopes[:, :, k] = harmonic_column(1, 1)
     columns = [wave.real, -wave.imag, np.ones((len(time), 1))]
     by = [slopes.real, -slopes.imag, np.zeros((len(unknowns), len(time), 1))]
     for order, power in form.harmonics:
-        column, slope = turned(order, power)
+        column, slope = harmonic_column(order, power)
         for part, part_by in ((column.real, slope.real), (-column.imag, -slope.imag))[
             : 2 if order else 1
         ]:
@@ -112,10 +112,10 @@ def decaying_columns(
 
 
 def _flow(time: np.ndarray, pole: complex, terms: np.ndarray, powers: tuple[int, ...]) -> _Flow:
-    """The decay of the moving mode; NaN where it stops before the record ends."""
+    """The decay of the amplitude-dependent mode; NaN if it stops before the record ends."""
     powered = np.array((0, *powers))
     decay = np.concatenate([[-pole.real], terms[: len(powers)]])
-    turn = np.concatenate([[pole.imag], terms[len(powers) :]])
+    rotation = np.concatenate([[pole.imag], terms[len(powers) :]])
     span, count = float(time[-1]), 2 * len(powered)
     depth = 1.0 + 1.5 * max(decay[0], 0.0) * span
     none = np.full((count, len(time)), np.nan)
@@ -123,7 +123,7 @@ def _flow(time: np.ndarray, pole: complex, terms: np.ndarray, powers: tuple[int,
     while True:
         fall = np.linspace(0.0, depth, _NODES)
         by_power = np.exp(-powered[:, None] * fall)
-        rate, omega = decay @ by_power, turn @ by_power
+        rate, omega = decay @ by_power, rotation @ by_power
         if not np.isfinite(rate).all() or rate.min() <= _SLOWEST * rate.max():
             return nothing
         when = cumulative_simpson(1 / rate, x=fall, initial=0)
@@ -134,45 +134,45 @@ def _flow(time: np.ndarray, pole: complex, terms: np.ndarray, powers: tuple[int,
         depth = min(1.5 * depth * max(1.0, span / max(when[-1], span / 4)), 2 * _DEEPEST)
     over = cumulative_simpson(by_power / rate, x=fall, initial=0, axis=1)
     twice = cumulative_simpson(by_power / rate**2, x=fall, initial=0, axis=1)
-    turning = cumulative_simpson(omega * by_power / rate**2, x=fall, initial=0, axis=1)
+    by_phase = cumulative_simpson(omega * by_power / rate**2, x=fall, initial=0, axis=1)
     inside = np.minimum(time, when[-1])
 
     def at_samples(values: np.ndarray, by_fall: np.ndarray) -> np.ndarray:
         return CubicHermiteSpline(when, values, by_fall * rate, axis=-1)(inside)
 
     slope = np.gradient(rate, fall)
-    turn_slope = np.gradient(omega, fall)
+    omega_slope = np.gradient(omega, fall)
     log_by = -twice * rate
-    phase_by = -turning + omega * twice
+    phase_by = -by_phase + omega * twice
     none = np.zeros_like(over)
     return _Flow(
         at_samples(-fall, -np.ones_like(fall)),
-        at_samples(turn @ over, omega / rate),
+        at_samples(rotation @ over, omega / rate),
         at_samples(
             np.concatenate([log_by, none]), np.concatenate([-by_power / rate - twice * slope, none])
         ),
         at_samples(
-            np.concatenate([phase_by, over]), np.concatenate([turn_slope * twice, by_power / rate])
+            np.concatenate([phase_by, over]), np.concatenate([omega_slope * twice, by_power / rate])
         ),
     )
 
 
 class DecayFit(NamedTuple):
-    """The least-squares fit of some waves; see `WaveForm` for the unknowns."""
+    """The least-squares fit of decaying waves; see `WaveForm` for the unknowns."""
 
     unknowns: Float[np.ndarray, " unknown"]
     form: WaveForm
     fit: SeparableFit
-    scale: Float[np.ndarray, " channel"]  # 1σ of a sample by the residuals
+    scale: Float[np.ndarray, " channel"]  # 1σ of a sample, from the residuals
 
     @property
     def natural_frequency(self) -> Float[np.ndarray, " mode"]:
-        """rad/s; at no amplitude."""
+        """rad/s; at zero amplitude."""
         return self.unknowns[: self.form.n_modes]
 
     @property
     def damping_ratio(self) -> Float[np.ndarray, " mode"]:
-        """At no amplitude."""
+        """At zero amplitude."""
         return self.unknowns[self.form.n_modes : 2 * self.form.n_modes]
 
     @property
@@ -193,15 +193,15 @@ class DecayFit(NamedTuple):
 
     @property
     def information(self) -> float:
-        """Schwarz' criterion: twice the logarithm of the likelihood, less what unknowns cost."""
-        size = self.fit.residuals.shape
+        """Schwarz' criterion: twice the log likelihood less the penalty for unknowns."""
+        shape = self.fit.residuals.shape
         square = np.mean(self.residuals**2, axis=1)
-        likely = -size[1] * np.sum(np.log(np.maximum(square, 1e-300)))
-        return float(likely - self.n_unknowns * np.log(size[0] * size[1]))
+        log_likelihood = -shape[1] * np.sum(np.log(np.maximum(square, 1e-300)))
+        return float(log_likelihood - self.n_unknowns * np.log(shape[0] * shape[1]))
 
     @property
     def n_unknowns(self) -> int:
-        """All that was fitted, coefficients of every channel among them."""
+        """All fitted values, including the coefficients of every channel."""
         return len(self.unknowns) + self.fit.coefficients.size
 
     @property
@@ -210,7 +210,7 @@ class DecayFit(NamedTuple):
         return self.fit.residuals * self.scale[:, None]
 
     def energy(self, time: Float[np.ndarray, " sample"]) -> Float[np.ndarray, " mode"]:
-        """Of every mode over the record, in units of the noise."""
+        """Energy of every mode over the record, in units of the noise."""
         falls = np.exp(-2 * time[:, None] * self.natural_frequency * self.damping_ratio)
         return np.sum(np.abs(self.amplitude / self.scale[:, None]) ** 2, axis=0) * falls.sum(axis=0)
 
@@ -224,15 +224,15 @@ def fit_waves(
     *,
     settled: float = _SETTLED,
 ) -> DecayFit:
-    """The fit from given unknowns, each channel weighted by the size of its own residuals."""
+    """The fit from given unknowns, each channel weighted by the rms of its residuals."""
     scale = 0.1 * np.sqrt(np.mean(values**2, axis=1)) if scale is None else scale
     scale = np.maximum(scale, 1e-12 * max(float(np.abs(values).max()), 1e-300))
-    n, moving = form.n_modes, len(form.powers)
+    n, n_powers = form.n_modes, len(form.powers)
     for _ in range(_ROUNDS):
         omega = unknowns[:n]
-        # A mode may grow a little over the record: hum, or one that is then left out for that.
+        # A mode may grow slightly over the record: hum, or a mode that is left out later.
         growth = -np.minimum(_MOST_GROWTH / (omega * time[-1]), _MOST_DAMPED)
-        moved = np.full(2 * moving, _MOST_MOVED * omega[form.leading])
+        moved = np.full(2 * n_powers, _MOST_MOVED * omega[form.leading])
         low = np.concatenate([0.8 * omega, growth, -moved])
         high = np.concatenate([1.25 * omega, np.full(n, _MOST_DAMPED), moved])
         unknowns = _feasible(time, np.clip(unknowns, low, high), form)
@@ -255,7 +255,7 @@ def fit_waves(
 
 
 def _feasible(time: np.ndarray, unknowns: np.ndarray, form: WaveForm) -> np.ndarray:
-    """With less of what moves with the amplitude where the mode would not decay all along."""
+    """Unknowns with a weaker amplitude dependence, if the mode would not decay throughout."""
     n, k, feasible = form.n_modes, form.leading, unknowns.copy()
     for part in (1.0, 0.5, 0.2, 0.0) if form.powers else ():
         feasible[2 * n :] = part * unknowns[2 * n :]
@@ -273,9 +273,9 @@ def with_modes(
     now: DecayFit | None = None,
     most: int = _MOST_MODES,
 ) -> DecayFit | None:
-    """The fit with those poles whose waves stand out of what the others leave, the largest first.
+    """The fit with poles added whose waves are significant in the residuals, the largest first.
 
-    Returns None where none does.
+    Returns None if none is.
     """
     left = list(candidates)
     while left and (now is None or now.form.n_modes < most):
@@ -288,23 +288,23 @@ def with_modes(
     return now
 
 
-def significant(found: DecayFit) -> Bool[np.ndarray, " mode"]:
-    """Whether a mode's largest amplitude is four times its standard error."""
-    sure = np.abs(found.amplitude) / found.amplitude_std
-    return sure.max(axis=0) >= SIGNIFICANT
+def significant(fit: DecayFit) -> Bool[np.ndarray, " mode"]:
+    """Whether a mode's largest amplitude is at least four times its standard error."""
+    ratio = np.abs(fit.amplitude) / fit.amplitude_std
+    return ratio.max(axis=0) >= SIGNIFICANT
 
 
 def without_mode(
     values: Float[np.ndarray, "channel sample"],
     time: Float[np.ndarray, " sample"],
-    found: DecayFit,
+    fit: DecayFit,
     mode: int,
 ) -> DecayFit:
-    """The fit with one mode less, which is not the leading one of a form that moves."""
-    n, form = found.form.n_modes, found.form
-    unknowns = np.delete(found.unknowns, [mode, n + mode])
+    """The fit with one mode less, other than an amplitude-dependent leading mode."""
+    n, form = fit.form.n_modes, fit.form
+    unknowns = np.delete(fit.unknowns, [mode, n + mode])
     form = form._replace(n_modes=n - 1, leading=form.leading - (mode < form.leading))
-    return fit_waves(values, time, unknowns, form, found.scale)
+    return fit_waves(values, time, unknowns, form, fit.scale)
 
 
 def _added(now: DecayFit | None, pole: complex) -> tuple[np.ndarray, WaveForm]:
@@ -318,7 +318,7 @@ def _added(now: DecayFit | None, pole: complex) -> tuple[np.ndarray, WaveForm]:
 def with_harmonics(
     values: Float[np.ndarray, "channel sample"], time: Float[np.ndarray, " sample"], now: DecayFit
 ) -> DecayFit:
-    """The fit with those harmonics of the leading mode that stand out of what is left."""
+    """The fit with harmonics of the leading mode added that are significant in the residuals."""
     step = time[1] - time[0]
     fastest = now.natural_frequency[now.form.leading] * (1 + _MOST_SHIFT)
     open_ones = [
@@ -329,11 +329,11 @@ def with_harmonics(
     whole = now.form._replace(harmonics=(*now.form.harmonics, *open_ones))
     columns = decaying_columns(time, now.unknowns, whole).columns
     first = 2 * now.form.n_modes + 1
-    places = np.repeat(
+    owner = np.repeat(
         np.arange(len(whole.harmonics)), [2 if order else 1 for order, _ in whole.harmonics]
     )
     known = np.concatenate(
-        [np.arange(first), first + np.flatnonzero(places < len(now.form.harmonics))]
+        [np.arange(first), first + np.flatnonzero(owner < len(now.form.harmonics))]
     )
     chosen = list(now.form.harmonics)
     space, left = _unit(columns[:, known]), now.fit.residuals
@@ -341,12 +341,12 @@ def with_harmonics(
         gains = np.zeros(len(whole.harmonics))
         for k, harmonic in enumerate(whole.harmonics):
             if harmonic not in chosen:
-                gains[k], _ = _gain(columns[:, first + np.flatnonzero(places == k)], space, left)
+                gains[k], _ = _gain(columns[:, first + np.flatnonzero(owner == k)], space, left)
         best = int(np.argmax(gains)) if gains.size else 0
         if not gains.size or gains[best] < SIGNIFICANT**2:
             break
         chosen.append(whole.harmonics[best])
-        _, new = _gain(columns[:, first + np.flatnonzero(places == best)], space, left)
+        _, new = _gain(columns[:, first + np.flatnonzero(owner == best)], space, left)
         left = left - (left @ new) @ new.T
         left = left / np.maximum(np.std(left, axis=1, keepdims=True), 1e-300)
         space = np.concatenate([space, new], axis=1)
@@ -363,13 +363,13 @@ def _unit(columns: np.ndarray) -> np.ndarray:
 
 
 def _gain(columns: np.ndarray, space: np.ndarray, left: np.ndarray) -> tuple[float, np.ndarray]:
-    """By how much columns would lower the sum of squares of the channel that has most of them.
+    """Largest reduction of a channel's sum of squares by additional columns.
 
-    And an orthonormal basis of what they have beyond `space`.
+    And an orthonormal basis of their part outside `space`.
     """
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    new, size = np.linalg.qr(columns - space @ (space.T @ columns))
-    new = new[:, np.abs(np.diag(size)) > _NEW]
+    new, triangle = np.linalg.qr(columns - space @ (space.T @ columns))
+    new = new[:, np.abs(np.diag(triangle)) > _NEW]
     return float(np.max(np.sum((left @ new) ** 2, axis=1), initial=0.0)), new
 
 

@@ -1,7 +1,7 @@
 """Linear modes from free decays: eigensystem realisation, then a fit of decaying oscillations.
 
 y_i(t) = Σ_r e^(−ζωt) (a cos ω_d t + b sin ω_d t) + c. A decay has no force: frequencies, damping
-and ratios of shapes follow, no scale.
+and relative shapes are identified, without a scale.
 Reference: Juang & Pappa, J. Guid. Control Dyn. 8 (1985) 620, doi:10.2514/3.20031.
 """
 
@@ -28,8 +28,8 @@ from snrmjax.identify.modal.small_motion import (
     envelope,
     frequency_at,
     is_linear,
-    left_by_linear_modes,
     noise_of_channels,
+    nonlinear_before_last_part,
     parts_of_decay,
     small_motion,
 )
@@ -44,19 +44,19 @@ _HIGHEST = 30  # half the model order
 _MOST_ROWS, _MOST_COLUMNS = 240, 3000  # of a Hankel matrix
 _MOST_SAMPLES = 40_000  # of a channel, in the fit
 _FEWEST_SAMPLES = 40
-_SAMPLES_PER_CYCLE = 5  # kept of the highest frequency asked for
-_LONG = 12_000  # samples of a channel, from which on a record is cut and thinned to what it holds
-_SAMPLES_OF_LINE = 3  # kept of a cycle of the highest line: the filter passes 0.8 of half the rate
-_ABOVE = 30.0  # of the median power of a spectrum, which noise exceeds once in 1e9 lines
-_FILTER_ENDS = 20  # samples that a thinning filter spoils
-_BEYOND = 1.3  # of the time in which the motion is larger than the noise
+_SAMPLES_PER_CYCLE = 5  # kept per cycle of the highest requested frequency
+_LONG = 12_000  # samples of a channel, above which a record is cut and decimated to its content
+_SAMPLES_OF_LINE = 3  # kept per cycle of the highest line: the filter passes 0.8 of half the rate
+_ABOVE = 30.0  # times the median power of a spectrum, exceeded by noise once in 1e9 lines
+_FILTER_ENDS = 20  # samples affected by a decimation filter
+_BEYOND = 1.3  # times the duration in which the motion exceeds the noise
 _NOTHING = "no mode of positive damping stands out of the noise of the decay."
-_FEW_MODES = 6  # with which a record is tried for being linear
-_CORRELATED = 2.0  # sum of the correlations of residuals, from which on it is worth a note
+_FEW_MODES = 6  # in the test of a record for linearity
+_CORRELATED = 2.0  # sum of the correlations of residuals that gives a note
 
 
 class DecayCurves(NamedTuple):
-    """Signals as recorded and as the modes give them, SI."""
+    """Recorded and fitted signals, SI."""
 
     time: Float[np.ndarray, " sample"]  # s
     measured: Float[np.ndarray, "channel sample"]
@@ -98,20 +98,20 @@ def fit_free_decay(
     """Frequencies, damping ratios and relative shapes from free decays, with covariance.
 
     Poles of all orders of an eigensystem realisation start a least-squares fit of decaying
-    oscillations to all channels and decays together, the strongest first; the size of each
-    channel's residuals and the correlation of neighbouring ones give the errors. Where frequency
-    or damping of the strongest mode change with its amplitude, the modes are those at no
-    amplitude, by a fit of that change (see `small_motion`).
+    oscillations to all channels and decays together, the strongest first; the rms of each
+    channel's residuals and the correlation of neighbouring ones give the errors. If frequency or
+    damping of the strongest mode change with its amplitude, that change is fitted too, and the
+    modes are those at zero amplitude (see `small_motion`).
 
-    Arguments: one recording or several of the same channels and rate; `channels` by name, all that
-    are a motion by default; `start_time`, `end_time` s of the part to use (from the largest
-    value, to the end); `to_frequency` rad/s the highest of interest, to which long records are
-    low-passed and thinned; `poles` natural frequencies in rad/s in place of clusters; `progress`
-    is called with how many parts of how many are fitted where a record takes long.
+    Arguments: one recording or several of the same channels and rate; `channels` by name, by
+    default all motions; `start_time`, `end_time` s of the part to use (from the largest value, to
+    the end); `to_frequency` rad/s the highest of interest, to which long records are low-passed and
+    decimated; `poles` natural frequencies in rad/s in place of clusters; `progress` is called with
+    the number of fitted parts and their total.
     Raises `ValueError` for recordings that differ in channels or rate, no motion, fewer than 40
-    samples, signals of zeros, where no pole is stable over the order, and for a mode that
-    changes with its amplitude down to where the record ends or drowns in noise.
-    Validity: nothing acts on the structure in that part.
+    samples, zero signals, no stable pole, and for a mode that still changes with its amplitude
+    where the record ends or disappears in noise.
+    Validity: no force acts on the structure in that part.
     Not differentiable: differentiate `snrmjax.model.linear_response`.
     """
     recordings = [decays] if isinstance(decays, TimeRecording) else list(decays)
@@ -124,14 +124,14 @@ def fit_free_decay(
     values = np.concatenate([part[:, :length] for part in parts])
     samples, highest_line = _SAMPLES_PER_CYCLE, to_frequency
     if highest_line is None and values.shape[1] > _LONG:
-        values = _while_it_rings(values, rate)
+        values = _above_noise(values, rate)
         samples, highest_line = _SAMPLES_OF_LINE, _highest_line(values, rate)
     if highest_line is not None:
         step = max(1, int(rate / (samples * highest_line / HERTZ)))
         for factor in _factors(step):
             values = decimate(values, factor, axis=1, zero_phase=True)
             rate /= factor
-            # At the ends the filter sees one side of the record.
+            # Near the ends the filter has data on one side only.
             values = values[:, _FILTER_ENDS:-_FILTER_ENDS]
     values = values[:, :_MOST_SAMPLES]
     if values.shape[1] < _FEWEST_SAMPLES:
@@ -141,8 +141,8 @@ def fit_free_decay(
     highest = min(highest_order or _HIGHEST, values.shape[1] // 8)
     orders = _realised(values, rate, highest)
     top = np.pi * rate if to_frequency is None else to_frequency
-    found = _found(values, rate, orders, top, poles, progress)
-    return _result(values, rate, found, orders, tuple(used))
+    modes = _decay_modes(values, rate, orders, top, poles, progress)
+    return _result(values, rate, modes, orders, tuple(used))
 
 
 def _channels(recordings: Sequence[TimeRecording], names: Sequence[str] | None) -> list[Channel]:
@@ -184,7 +184,7 @@ def _part(
     if not np.isfinite(values).all():
         raise ValueError(f"decay {number + 1} has samples that are not finite.")
     if not np.any(values):
-        raise ValueError(f"decay {number + 1} is zero all along.")
+        raise ValueError(f"decay {number + 1} is zero throughout.")
     if start is None:
         scaled = np.abs(values - np.median(values, axis=1, keepdims=True))
         start = float(time[np.argmax(scaled.max(axis=0))])
@@ -198,15 +198,15 @@ def _part(
     return values[:, keep]
 
 
-def _while_it_rings(values: np.ndarray, rate: float) -> np.ndarray:
-    """The record to somewhat beyond where the motion is smaller than the noise of a sample."""
-    size, _ = envelope(values, noise_of_channels(values), rate)
-    end = int(_BEYOND * np.count_nonzero(size > 1.0))
+def _above_noise(values: np.ndarray, rate: float) -> np.ndarray:
+    """The record up to slightly after the motion falls below the noise of a sample."""
+    amplitude, _ = envelope(values, noise_of_channels(values), rate)
+    end = int(_BEYOND * np.count_nonzero(amplitude > 1.0))
     return values[:, : max(end, _FEWEST_SAMPLES)]
 
 
 def _highest_line(values: np.ndarray, rate: float) -> float:
-    """The highest frequency in rad/s that stands out of the noise."""
+    """The highest frequency in rad/s above the noise."""
     window = np.hanning(values.shape[1])
     away = values - values.mean(axis=1, keepdims=True)
     power = np.abs(np.fft.rfft(away * window, axis=1)) ** 2
@@ -216,7 +216,7 @@ def _highest_line(values: np.ndarray, rate: float) -> float:
 
 
 def _factors(step: int) -> list[int]:
-    """A thinning by steps of at most eight, as the filter wants."""
+    """Factors of at most eight for a decimation in stages."""
     factors = []
     while step > 1:
         factor = min(step, 8)
@@ -227,8 +227,8 @@ def _factors(step: int) -> list[int]:
 
 def _realised(values: np.ndarray, rate: float, highest: int) -> PoleOrders:
     """Poles of even orders from the singular vectors of a block Hankel matrix."""
-    size = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
-    scaled = values / np.where(size > 0, size, 1.0)
+    rms = np.sqrt(np.mean(values**2, axis=1, keepdims=True))
+    scaled = values / np.where(rms > 0, rms, 1.0)
     channels, samples = scaled.shape
     rows = max(min(samples // 2, max(_MOST_ROWS // channels, 4)), 4)
     columns = min(samples - rows + 1, _MOST_COLUMNS)
@@ -254,7 +254,7 @@ def _start(
         damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < LIGHTLY_DAMPED)]
         if not wanted.size or np.any(wanted <= 0) or np.any(wanted >= top) or not damped.size:
             raise ValueError(
-                f"poles must be from 0 to {top / HERTZ:.6g} Hz, where the decay shows some, but "
+                f"poles must be from 0 to {top / HERTZ:.6g} Hz, where the decay has some, but "
                 f"are {', '.join(f'{one / HERTZ:.6g}' for one in wanted) or 'none'}."
             )
         return np.array([damped[np.argmin(np.abs(np.abs(damped) - one))] for one in wanted])
@@ -268,32 +268,32 @@ def _start(
     return stable
 
 
-class FoundModes(NamedTuple):
-    """The fit, which of its modes are modes, and from which sample on."""
+class AcceptedModes(NamedTuple):
+    """The fit, its accepted modes and its first sample."""
 
     decay: DecayFit
     kept: np.ndarray
     first: int = 0
-    spread: np.ndarray = np.zeros(2)  # 1σ of ω and ζ of the leading mode beyond its fit's
+    spread: np.ndarray = np.zeros(2)  # additional 1σ of ω and ζ of the leading mode
     notes: tuple[Fact, ...] = ()
 
 
-def _found(
+def _decay_modes(
     values: np.ndarray,
     rate: float,
     orders: PoleOrders,
     top: float,
     poles: Sequence[float] | None,
     progress: Callable[[int, int], None] | None,
-) -> FoundModes:
-    """The modes of the whole record, or where they move with the amplitude those at none."""
+) -> AcceptedModes:
+    """The modes of the whole record, or at zero amplitude if they depend on it."""
     start = _start(orders, poles, top)
     time, noise = np.arange(values.shape[1]) / rate, noise_of_channels(values)
 
     def candidates(part: np.ndarray) -> list[complex]:
         highest = min(orders.highest, part.shape[1] // 8)
-        found = clusters(_realised(part, rate, highest), (0.0, top))
-        return [complex(pole) for pole in found if pole.real < 0]
+        stable = clusters(_realised(part, rate, highest), (0.0, top))
+        return [complex(pole) for pole in stable if pole.real < 0]
 
     if poles is None:
         few = with_modes(values, time, start, most=_FEW_MODES)
@@ -303,57 +303,57 @@ def _found(
     parts: list[PartFit] = []
     if few is not None and not is_linear(values, time, few, noise):
         parts = parts_of_decay(values, rate, candidates, noise, progress)
-    if parts and any(part.bent for part in parts):
-        return _moving(parts, values, rate)
-    found = few if poles is not None else with_modes(values, time, start, few)
-    if found is None:
+    if parts and any(part.depends_on_amplitude for part in parts):
+        return _amplitude_dependent(parts, values, rate)
+    fit = few if poles is not None else with_modes(values, time, start, few)
+    if fit is None:
         raise ValueError(_NOTHING)
     if poles is not None:
-        return FoundModes(found, np.ones(found.form.n_modes, dtype=bool))
-    if parts and left_by_linear_modes(parts, found, noise):
-        return _moving(parts, values, rate)
-    kept = significant(found)
-    while not kept.all() and found.form.n_modes > 1:
-        found = without_mode(values, time, found, int(np.flatnonzero(~kept)[0]))
-        kept = significant(found)
-    kept &= found.damping_ratio > 0
+        return AcceptedModes(fit, np.ones(fit.form.n_modes, dtype=bool))
+    if parts and nonlinear_before_last_part(parts, fit, noise):
+        return _amplitude_dependent(parts, values, rate)
+    kept = significant(fit)
+    while not kept.all() and fit.form.n_modes > 1:
+        fit = without_mode(values, time, fit, int(np.flatnonzero(~kept)[0]))
+        kept = significant(fit)
+    kept &= fit.damping_ratio > 0
     if not kept.any():
         raise ValueError(_NOTHING)
-    return FoundModes(found, kept)
+    return AcceptedModes(fit, kept)
 
 
-def _moving(parts: list[PartFit], values: np.ndarray, rate: float) -> FoundModes:
+def _amplitude_dependent(parts: list[PartFit], values: np.ndarray, rate: float) -> AcceptedModes:
     chosen, kept = small_motion(parts, values, rate)
-    found = chosen.found
-    omega = found.natural_frequency[found.form.leading]
+    fit = chosen.fitted
+    omega = fit.natural_frequency[fit.form.leading]
     note = Fact(
         "decay_moves_with_amplitude",
         frequency_hz=float(omega) / HERTZ,
         begin=chosen.first / rate,
         from_hz=frequency_at(values, chosen.first, rate, float(omega)),
-        powers=found.form.powers,
+        powers=fit.form.powers,
     )
-    return FoundModes(found, kept, chosen.first, chosen.spread, (note,))
+    return AcceptedModes(fit, kept, chosen.first, chosen.spread, (note,))
 
 
 def _result(
     values: np.ndarray,
     rate: float,
-    found: FoundModes,
+    modes: AcceptedModes,
     orders: PoleOrders,
     channels: tuple[Channel, ...],
 ) -> DecayModes:
-    fit, unknowns, n = found.decay.fit, found.decay.unknowns, found.decay.form.n_modes
-    kept = np.flatnonzero(found.kept)
+    fit, unknowns, n = modes.decay.fit, modes.decay.unknowns, modes.decay.form.n_modes
+    kept = np.flatnonzero(modes.kept)
     rank = kept[np.argsort(unknowns[kept])]
     covariance = np.stack([fit.covariance[np.ix_([k, n + k], [k, n + k])] for k in rank])
-    covariance[rank == found.decay.form.leading, (0, 1), (0, 1)] += found.spread**2
+    covariance[rank == modes.decay.form.leading, (0, 1), (0, 1)] += modes.spread**2
     n_channels = len(channels)
-    values = values[:, found.first :]
+    values = values[:, modes.first :]
     time = np.arange(values.shape[1]) / rate
-    fitted = values - found.decay.residuals
-    amplitude = found.decay.amplitude[:n_channels, rank]
-    spread = found.decay.amplitude_std[:n_channels, rank]
+    fitted = values - modes.decay.residuals
+    amplitude = modes.decay.amplitude[:n_channels, rank]
+    spread = modes.decay.amplitude_std[:n_channels, rank]
     top = np.argmax(np.abs(amplitude), axis=0)
     n = len(rank)
     largest = amplitude[top, np.arange(n)]
@@ -361,7 +361,7 @@ def _result(
     shape_std = np.hypot(spread, np.abs(ratio) * spread[top, np.arange(n)]) / np.abs(largest)
     shape_std[top, np.arange(n)] = 0.0
     collinearity, _ = phase_collinearity(ratio)
-    notes = list(found.notes) + [
+    notes = list(modes.notes) + [
         Fact("complex_mode", mode=k + 1, frequency_hz=float(omega) / HERTZ, collinearity=value)
         for k, (omega, value) in enumerate(zip(unknowns[rank], collinearity.tolist(), strict=True))
         if value < REAL
@@ -372,7 +372,7 @@ def _result(
         notes.append(Fact("decay_residuals_correlated"))
     return DecayModes(
         natural_frequency=unknowns[rank],
-        damping_ratio=found.decay.damping_ratio[rank],
+        damping_ratio=modes.decay.damping_ratio[rank],
         mode_covariance=covariance,
         collinearity=collinearity,
         orders=orders,

@@ -30,21 +30,21 @@ from snrmjax.numerics.units import HERTZ
 
 ResidualTerms = Literal["auto", "both", "lower", "upper", "none"]
 
-_HIGHEST = 40  # order, where there are lines enough
+_HIGHEST = 40  # largest model order, with enough lines
 _LINES_PER_ORDER = 4
-_USUAL = 0.01  # damping ratio where no pole of the orders is near
-_NEAR = 0.02  # of a frequency: how far from one given by hand a pole may lie
-_NARROW = 1.1  # ratio of a band's ends, below which one residual term is enough
-_TWINS = 0.1  # of a decay rate: poles nearer than that are one mode, split by the fit
-_CURVED = 12.0  # a sensor, in units of the noise, that a further residual term must explain
+_USUAL = 0.01  # damping ratio assumed where no pole is near
+_NEAR = 0.02  # of a frequency: largest distance of a pole from one given by hand
+_NARROW = 1.1  # ratio of a band's ends below which one residual term suffices
+_TWINS = 0.1  # of a decay rate: closer poles are one mode, split by the fit
+_SIGNIFICANT_CURVATURE = 12.0  # least reduction of χ² per sensor by a further residual term
 _EVEN = 1e-3  # of the line spacing
 
 
 class GrowingModes(ValueError):
-    """All modes that responses show have negative damping, as those of e^(-iΩt) have."""
+    """All modes of the responses have negative damping, as for the convention e^(-iΩt)."""
 
-    def __init__(self, found: str) -> None:
-        super().__init__(f"{found}: the responses seem to be conjugated, of e^(-iΩt).")
+    def __init__(self, modes: str) -> None:
+        super().__init__(f"{modes}: the responses seem to be conjugated, of e^(-iΩt).")
 
 
 @on_numbers("Differentiate `sj.model.linear_response`.")
@@ -64,22 +64,21 @@ def fit_linear_modes(
 ) -> LinearModalFit:
     """Natural frequencies, damping ratios and residues of real normal modes, with covariance.
 
-    Poles of all model orders (least-squares complex frequency estimator) are gathered into
-    clusters that are stable over the order; each starts a mode of
-    H = e^{iψ} [Σ A_r/(ω_r² − Ω² + 2iζ_rω_rΩ) + L/Ω² + U], fitted to all responses together by
-    weighted least squares. A mode whose residues are all within four standard errors of zero is
-    left out. Weights: stated `std`, or coherence, or sizes of additive and relative errors found
-    from the residuals. The sizes of the residuals scale the errors of each response, and the
-    correlation of neighbouring residuals widens them.
+    Poles of all model orders (least-squares complex frequency estimator) are grouped into clusters
+    that are stable over the order; each starts a mode of H = e^{iψ} [Σ A_r/(ω_r² − Ω² + 2iζ_rω_rΩ)
+    + L/Ω² + U], fitted to all responses together by weighted least squares. A mode whose residues
+    are all within four standard errors of zero is left out. Weights: stated `std`, or coherence, or
+    additive and relative errors estimated from the residuals. The rms of the residuals scales the
+    errors of each response, and the correlation of neighbouring residuals widens them.
 
-    Arguments: `poles` natural frequencies in rad/s to take in place of clusters; `order` takes all
-    lightly damped poles of one model order; `std` 1σ of real and of imaginary part, SI;
+    Arguments: `poles` natural frequencies in rad/s in place of clusters; `order` uses all lightly
+    damped poles of one model order; `std` 1σ of real and of imaginary part, SI;
     `reference` names one of several; the band in rad/s; `residual_terms` for modes outside the
-    band (1/Ω² below, a constant above, and Ω² where that shows); `instrument_phase` frees ψ, by
+    band (1/Ω² below, a constant above, and Ω² if significant); `instrument_phase` fits ψ, by
     default over a voltage only; `window` "hann" models the leakage of averages of random
     excitation, whose line spacing is one over the window's length.
-    Raises `ValueError` as `response_data` does, for no pole that is stable, for poles outside the
-    band, and for responses that seem to be conjugated.
+    Raises `ValueError` as `response_data` does, without a stable pole, for poles outside the band
+    and for responses that seem to be conjugated.
     Validity: real modes (see `collinearity` and `mean_phase`), linear and time-invariant.
     Not differentiable: differentiate `snrmjax.model.linear_response`.
 
@@ -88,8 +87,8 @@ def fit_linear_modes(
     >>> from snrmjax.measure.recordings.channels import Channel
     >>> from snrmjax.measure.recordings.frequency_responses import frequency_responses
     >>> tip, force = Channel("tip", "displacement"), Channel("hammer", "force")
-    >>> found = fit_linear_modes(frequency_responses(w, h[None, None], [tip], [force]))
-    >>> (found.natural_frequency / 2 / np.pi).round(6), found.residue.round(6)
+    >>> modes = fit_linear_modes(frequency_responses(w, h[None, None], [tip], [force]))
+    >>> (modes.natural_frequency / 2 / np.pi).round(6), modes.residue.round(6)
     (array([10.]), array([[2.]]))
     """
     data = response_data(
@@ -105,17 +104,17 @@ def fit_linear_modes(
     start = _start(data, orders, poles, order)
     fit, spread = _fitted(data, settings, start, keep_all=poles is not None)
     if residual_terms == "auto" and settings.lower:
-        settings, fit, spread = _curved_too(data, settings, fit, spread)
-    _check_found(fit, settings)
+        settings, fit, spread = _with_curvature(data, settings, fit, spread)
+    _check_modes(fit, settings)
     return modal_result(data, settings, fit, spread, orders)
 
 
 def basis_settings(
     data: ResponseData, terms: ResidualTerms, phase: bool, window: str | None
 ) -> BasisSettings:
-    """What the receptances of a band are made of beside modes, as `fit_linear_modes` is asked.
+    """Residual terms, phase and window of the receptances of a band, see `fit_linear_modes`.
 
-    Raises `ValueError` for other words, and for leakage between lines that are not on a grid.
+    Raises `ValueError` for unknown options, and for leakage between lines that are not on a grid.
     """
     if terms not in get_args(ResidualTerms):
         raise ValueError(
@@ -130,7 +129,7 @@ def basis_settings(
             raise ValueError(f"`window` must be 'hann' or None, but is {window!r}.")
         spacing = np.diff(data.omega)
         step = float(np.median(spacing))
-        # Lines may be left out, but they lie on a grid.
+        # Lines may be missing, but must lie on a grid.
         if np.any(np.abs(spacing / step - np.round(spacing / step)) > _EVEN):
             raise ValueError("leakage is modelled for evenly spaced lines, but these are not.")
         time = 2 * np.pi / step
@@ -152,15 +151,17 @@ def _orders(data: ResponseData, highest: int | None) -> PoleOrders:
         )
     measured, weights = filled_receptance(data), line_weights(data)
     weights = weights / np.sqrt(np.mean(np.abs(measured * weights) ** 2, axis=1))[:, None]
-    size = data.measured_size
-    turn = (1j ** np.array(data.powers))[:, None]
-    return poles_of_responses(data.omega, measured * size * turn, weights / size, highest or most)
+    factor = data.measured_factor
+    phase = (1j ** np.array(data.powers))[:, None]
+    return poles_of_responses(
+        data.omega, measured * factor * phase, weights / factor, highest or most
+    )
 
 
 def _start(
     data: ResponseData, orders: PoleOrders, poles: Sequence[float] | None, order: int | None
 ) -> Complex[np.ndarray, " mode"]:
-    """Poles to begin with."""
+    """Starting poles."""
     band = float(data.omega[0]), float(data.omega[-1])
     if poles is not None:
         return _by_hand(orders, np.asarray(poles, dtype=float), band)
@@ -170,12 +171,14 @@ def _start(
                 f"`order` must be from 1 to {orders.highest}, the highest that was computed, but "
                 f"is {order}."
             )
-        mine = orders.pole[orders.order == order]
-        inside = (np.abs(mine) >= band[0]) & (np.abs(mine) <= band[1])
-        mine = mine[inside & (mine.real < 0) & (-mine.real < LIGHTLY_DAMPED * np.abs(mine))]
-        if not mine.size:
+        of_order = orders.pole[orders.order == order]
+        inside = (np.abs(of_order) >= band[0]) & (np.abs(of_order) <= band[1])
+        of_order = of_order[
+            inside & (of_order.real < 0) & (-of_order.real < LIGHTLY_DAMPED * np.abs(of_order))
+        ]
+        if not of_order.size:
             raise ValueError(f"model order {order} has no lightly damped pole in the band.")
-        return mine[np.argsort(np.abs(mine))]
+        return of_order[np.argsort(np.abs(of_order))]
     stable = clusters(orders, band)
     damped, growing = stable[stable.real < 0], stable[stable.real > 0]
     if damped.size:
@@ -193,23 +196,23 @@ def _start(
 
 
 def _by_hand(
-    orders: PoleOrders, wanted: np.ndarray, band: tuple[float, float]
+    orders: PoleOrders, given: np.ndarray, band: tuple[float, float]
 ) -> Complex[np.ndarray, " mode"]:
-    if not wanted.size or not np.isfinite(wanted).all():
+    if not given.size or not np.isfinite(given).all():
         raise ValueError("`poles` must be natural frequencies, at least one.")
     chosen = []
-    for omega in np.sort(wanted):
+    for omega in np.sort(given):
         if not band[0] <= omega <= band[1]:
             raise ValueError(
                 f"a pole must lie in the band, {band[0] / HERTZ:.6g} to {band[1] / HERTZ:.6g} "
                 f"Hz, but {omega / HERTZ:.6g} Hz was given."
             )
         damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < LIGHTLY_DAMPED)]
-        away = np.abs(np.abs(damped) - omega)
-        near = damped[away < _NEAR * omega]
+        distance = np.abs(np.abs(damped) - omega)
+        near = damped[distance < _NEAR * omega]
         ratio = _USUAL
         if near.size:
-            best = near[np.argmin(away[away < _NEAR * omega])]
+            best = near[np.argmin(distance[distance < _NEAR * omega])]
             ratio = float(-best.real / abs(best))
         chosen.append(complex(-ratio * omega, omega * np.sqrt(1 - ratio**2)))
     return np.array(chosen)
@@ -222,7 +225,7 @@ def _fitted(
     *,
     keep_all: bool,
 ) -> tuple[SeparableFit, FitSpread]:
-    """The fit with its weights settled and insignificant modes left out."""
+    """The fit with converged weights, without insignificant modes."""
     unknowns = np.concatenate(
         [np.abs(start), -start.real / np.abs(start), np.zeros(int(settings.phase))]
     )
@@ -242,21 +245,21 @@ def _fitted(
     return fit, spread
 
 
-def _curved_too(
+def _with_curvature(
     data: ResponseData, settings: BasisSettings, fit: SeparableFit, spread: FitSpread
 ) -> tuple[BasisSettings, SeparableFit, FitSpread]:
-    """The fit with a residual term Ω² where it lowers the sum of squares by far."""
+    """The fit with a residual term Ω² where it lowers the sum of squares significantly."""
     wider = settings._replace(curved=True)
     other, own = weighted_fit(data, wider, fit.unknowns, spread.std, rounds=1)
     before, after = np.sum(fit.residuals**2), np.sum(other.residuals**2)
     free = np.count_nonzero(np.isfinite(data.receptance)) * 2
-    if (before - after) * free <= _CURVED * len(data.channels) * after:
+    if (before - after) * free <= _SIGNIFICANT_CURVATURE * len(data.channels) * after:
         return settings, fit, spread
     return wider, *weighted_fit(data, wider, other.unknowns, own.std)
 
 
 def _least_certain(fit: SeparableFit, settings: BasisSettings, data: ResponseData) -> int | None:
-    """The mode that stands least out of the errors or is none; None where all are modes."""
+    """The least significant or an implausible mode; None where all are modes."""
     natural, ratio, _ = unpacked(fit.unknowns, settings)
     n = len(natural)
     certain = np.zeros(n)
@@ -276,7 +279,7 @@ def _least_certain(fit: SeparableFit, settings: BasisSettings, data: ResponseDat
     return worst if certain[worst] < SIGNIFICANT else None
 
 
-def _check_found(fit: SeparableFit, settings: BasisSettings) -> None:
+def _check_modes(fit: SeparableFit, settings: BasisSettings) -> None:
     natural, ratio, _ = unpacked(fit.unknowns, settings)
     if np.all(ratio < 0):
         raise GrowingModes(

@@ -1,7 +1,7 @@
-"""Columns of a receptance by modes and residual terms, with their derivatives by the poles.
+"""Basis columns of a receptance: modes and residual terms, with derivatives by the poles.
 
 H(Ω) = e^{iψ} [Σ A_r/(ω_r² − Ω² + 2iζ_rω_rΩ) + L/Ω² + U], all A_r, L, U real: real normal modes with
-viscous modal damping, seen through an instrument that may turn the phase by ψ.
+viscous modal damping, measured through an instrument with a phase error ψ.
 """
 
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from jaxtyping import Complex, Float
 
 from snrmjax.identify.modal.separable_fit import TermColumns
 
-_NEWTON, _SETTLED = 40, 1e-9  # steps towards an amplitude, and the last one, relative
-_STEP = 1e-6  # relative, of the differences by poles of a windowed response
+_NEWTON, _SETTLED = 40, 1e-9  # largest number of Newton steps, and relative step at convergence
+_STEP = 1e-6  # relative, of finite differences of a windowed response
 
 
 class AmplitudeDependence(NamedTuple):
@@ -21,8 +21,8 @@ class AmplitudeDependence(NamedTuple):
 
     D(q) q = F with D = ω² − Ω² + 2iζωΩ + u² (s + itΩ/u)(|q|/R)^p, q its response per unit of
     residue: the unknown s is the relative change of the stiffness at the largest amplitude R, t/2ζ
-    that of the damping. q is the solution whose size is nearest `near`. With `apart` rows have a
-    frequency and a damping ratio of their own.
+    that of the damping. q is the solution with amplitude nearest to `near`. With `apart`, marked
+    rows have a separate frequency and damping ratio.
     """
 
     mode: int
@@ -30,24 +30,24 @@ class AmplitudeDependence(NamedTuple):
     damping: bool  # whether t is an unknown
     unit: float  # u, rad/s
     load: Float[np.ndarray, " line"]  # F
-    near: Float[np.ndarray, " line"]  # |q|, about
-    apart: Float[np.ndarray, " line"] | None = None  # 1 for rows with a mode of their own
+    near: Float[np.ndarray, " line"]  # |q|, approximate
+    apart: Float[np.ndarray, " line"] | None = None  # 1 for rows with separate values
 
     @property
     def n_terms(self) -> int:
-        """How many unknowns it adds: s, then t, then the changes of ω (over u) and of ζ."""
+        """Number of added unknowns: s, then t, then the changes of ω (over u) and of ζ."""
         return 1 + self.damping + 2 * (self.apart is not None)
 
 
 class BasisSettings(NamedTuple):
-    """What a receptance is made of, beside its modes.
+    """Terms of a receptance in addition to its modes.
 
     `window_time` is the length, s, of Hann's window in an averaged estimate; None: no leakage.
     """
 
     lower: bool = True  # a term 1/Ω²
     upper: bool = True  # a constant
-    curved: bool = False  # a term Ω²: of modes not far above the band
+    curved: bool = False  # a term Ω², for modes not far above the band
     phase: bool = False  # an unknown phase of the instrument
     window_time: float | None = None
     dependence: AmplitudeDependence | None = None
@@ -58,7 +58,7 @@ class BasisSettings(NamedTuple):
         return 0 if self.dependence is None else self.dependence.n_terms
 
     def modes_of(self, unknowns: Float[np.ndarray, " unknown"]) -> int:
-        """How many modes unknowns are of."""
+        """Number of modes in the unknowns."""
         return (len(unknowns) - self.phase - self.n_terms) // 2
 
 
@@ -79,11 +79,11 @@ def receptance_bases(
     """Bases of receptances, real parts above imaginary parts, terms: modes, 1/Ω², constant, Ω².
 
     Arguments: `unknowns` natural frequencies (rad/s), damping ratios, those of the amplitude
-    dependence, then the phase if it is unknown; `powers` of iΩ by which the receptance was
-    measured, which matter under a window.
+    dependence, then the phase if it is unknown; `powers` of iΩ in the measured
+    quantities, which matter under a window.
     """
     natural, ratio, angle = unpacked(unknowns, settings)
-    turn = np.exp(1j * angle)
+    phase_factor = np.exp(1j * angle)
     others = [omega**-2.0] * settings.lower + [np.ones_like(omega)] * settings.upper
     others += [(omega / omega[-1]) ** 2] * settings.curved
     bases = []
@@ -101,13 +101,13 @@ def receptance_bases(
             modes[:, k], by_frequency[:, k], by_ratio[:, k], terms = _dependent(
                 omega, (natural[k], ratio[k]), added, settings.dependence
             )
-        columns = turn * np.column_stack([modes, *others])
+        columns = phase_factor * np.column_stack([modes, *others])
         slopes = np.zeros((len(unknowns), *columns.shape), dtype=complex)
         at, n = np.arange(len(natural)), len(natural)
-        slopes[at, :, at] = turn * by_frequency.T
-        slopes[n + at, :, at] = turn * by_ratio.T
+        slopes[at, :, at] = phase_factor * by_frequency.T
+        slopes[n + at, :, at] = phase_factor * by_ratio.T
         if terms is not None and settings.dependence is not None:
-            slopes[2 * n : 2 * n + len(terms), :, settings.dependence.mode] = turn * terms
+            slopes[2 * n : 2 * n + len(terms), :, settings.dependence.mode] = phase_factor * terms
         if settings.phase:
             slopes[-1] = 1j * columns
         bases.append(TermColumns(real_and_imaginary(columns, 0), real_and_imaginary(slopes, 1)))
@@ -133,28 +133,28 @@ def _plain(
 def _dependent(
     omega: np.ndarray, mode: tuple[float, float], added: np.ndarray, of: AmplitudeDependence
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The column q/F of a mode that depends on its amplitude, and its derivatives.
+    """The column q/F of an amplitude-dependent mode, and its derivatives.
 
-    By frequency, ratio and the unknowns of the dependence. q solves a real equation for |q|, by
-    Newton's method; the derivatives are those of D(q) q = F and of its conjugate.
+    With respect to frequency, ratio and the unknowns of the dependence. q solves a real equation
+    for |q|, by Newton's method; the derivatives are those of D(q) q = F and of its conjugate.
     """
     apart = 0.0 if of.apart is None else of.apart
     own = added[-2:] if of.apart is not None else np.zeros(2)
     natural, ratio = mode[0] + own[0] * of.unit * apart, mode[1] + own[1] * apart
     strength = of.unit**2 * (added[0] + 1j * (added[1] if of.damping else 0.0) * omega / of.unit)
     linear = natural**2 - omega**2 + 2j * ratio * natural * omega
-    p, largest, size = of.power, float(of.near.max()), of.near.copy()
+    p, largest, amplitude = of.power, float(of.near.max()), of.near.copy()
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON):
-            dynamic = linear + strength * (size / largest) ** p
-            slope = p * np.real(np.conj(dynamic) * strength) * (size / largest) ** p
+            dynamic = linear + strength * (amplitude / largest) ** p
+            slope = p * np.real(np.conj(dynamic) * strength) * (amplitude / largest) ** p
             slope = np.abs(dynamic) ** 2 + slope
-            change = 0.5 * size * (np.abs(dynamic) ** 2 - (of.load / size) ** 2) / slope
-            size = np.clip(size - change, 0.5 * size, 2 * size)
-            settled = np.abs(change) < _SETTLED * size
+            change = 0.5 * amplitude * (np.abs(dynamic) ** 2 - (of.load / amplitude) ** 2) / slope
+            amplitude = np.clip(amplitude - change, 0.5 * amplitude, 2 * amplitude)
+            settled = np.abs(change) < _SETTLED * amplitude
             if settled.all():
                 break
-        fraction = (size / largest) ** p
+        fraction = (amplitude / largest) ** p
         q = of.load / (linear + strength * fraction)
         q = np.where(settled, q, np.nan)
         ahead = linear + strength * fraction * (1 + p / 2)
@@ -162,8 +162,8 @@ def _dependent(
 
         def slope_by(equation: np.ndarray) -> np.ndarray:
             g = equation * q
-            found = behind * np.conj(g) - np.conj(ahead) * g
-            return found / (np.abs(ahead) ** 2 - np.abs(behind) ** 2) / of.load
+            slope = behind * np.conj(g) - np.conj(ahead) * g
+            return slope / (np.abs(ahead) ** 2 - np.abs(behind) ** 2) / of.load
 
         by_frequency = slope_by(2 * natural + 2j * ratio * omega)
         by_ratio = slope_by(2j * natural * omega)
@@ -197,8 +197,8 @@ def _windowed(s: Complex[np.ndarray, "..."], time: float) -> Complex[np.ndarray,
     r(τ) = (1 − τ/T)(2/3 + cos(2πτ/T)/3) + sin(2πτ/T)/(2π). An averaged cross-spectrum of
     stationary signals is that of the impulse response times r.
     """
-    turn = 2j * np.pi / time
-    ahead, behind = s + turn, s - turn
+    shift = 2j * np.pi / time
+    ahead, behind = s + shift, s - shift
     falling = 2 / 3 * _falling(s, time) + (_falling(ahead, time) + _falling(behind, time)) / 6
     return falling + (_constant(ahead, time) - _constant(behind, time)) / (4j * np.pi)
 

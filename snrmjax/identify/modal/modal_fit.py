@@ -1,4 +1,4 @@
-"""What a fit of linear modes found: poles, residues and residual terms with their errors."""
+"""Results of fits of linear modes: poles, residues and residual terms with their errors."""
 
 from abc import abstractmethod
 from typing import ClassVar, NamedTuple
@@ -22,18 +22,18 @@ REAL = 0.9
 
 
 class ResponseCurves(NamedTuple):
-    """Receptances as measured and as the modes give them, SI."""
+    """Measured and fitted receptances, SI."""
 
     omega: Float[np.ndarray, " line"]  # rad/s
     measured: Complex[np.ndarray, "sensor line"]  # NaN where not measured
     fitted: Complex[np.ndarray, "sensor line"]
-    std: Float[np.ndarray, "sensor line"]  # 1σ of real and of imaginary part that weighted them
+    std: Float[np.ndarray, "sensor line"]  # 1σ of real and of imaginary part, used as weights
 
 
 class AbstractModalFit(AbstractResult):
-    """Linear modes by frequency as a fit found them, with their errors.
+    """Fitted linear modes in order of frequency, with their errors.
 
-    `mode_covariance` of a mode begins with natural frequency (rad/s) and damping ratio.
+    `mode_covariance` of a mode starts with natural frequency (rad/s) and damping ratio.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("mode", "sensor")
@@ -72,7 +72,7 @@ class AbstractModalFit(AbstractResult):
 
     @abstractmethod
     def source_in_words(self) -> str:
-        """What the modes are from."""
+        """The data that the modes were fitted to."""
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`; 95 % bands."""
@@ -108,7 +108,7 @@ class AbstractModalFit(AbstractResult):
 def phase_collinearity(
     shape: Complex[np.ndarray, "sensor mode"],
 ) -> tuple[Float[np.ndarray, " mode"], Float[np.ndarray, " mode"]]:
-    """Modal phase collinearity, NaN for one sensor, and the mean phase (rad) away from real.
+    """Modal phase collinearity, NaN for one sensor, and the mean phase (rad) of the shape.
 
     Reference: Pappa, Elliott & Schenk, J. Guid. Control Dyn. 16 (1993) 860, doi:10.2514/3.21092.
     """
@@ -123,8 +123,8 @@ class LinearModalFit(AbstractModalFit):
     """Linear modes from frequency responses over one reference; see `fit_linear_modes`.
 
     H = e^{iψ} [Σ residue/(ω² − Ω² + 2iζωΩ) + lower/Ω² + upper] is a displacement over the
-    reference. Over a force in N a residue is φ_sensor φ_driven in 1/kg. `mode_covariance` goes on
-    with the residues of all sensors.
+    reference. Over a force in N a residue is φ_sensor φ_driven in 1/kg. `mode_covariance`
+    continues with the residues of all sensors.
     """
 
     residue: Float[np.ndarray, "sensor mode"]  # displacement over reference, times s^-2
@@ -138,7 +138,7 @@ class LinearModalFit(AbstractModalFit):
     )
     phase: float  # rad, ψ of the instrument; 0 where it was not fitted
     phase_std: float
-    # Away from real.
+    # Deviation from real residues.
     mean_phase: Float[np.ndarray, " mode"] = quantity("mode", "deg", "phase of complex residues")
     mean_phase_std: Float[np.ndarray, " mode"]
     lines_in_band: Float[np.ndarray, " mode"] = quantity(
@@ -156,7 +156,7 @@ class LinearModalFit(AbstractModalFit):
         return np.sqrt(np.diagonal(self.mode_covariance, axis1=1, axis2=2)[:, 2:]).T
 
     def sensor_number(self, name: str) -> int:
-        """Where a sensor stands. Raises `ValueError` that lists those there are."""
+        """Index of a sensor. Raises `ValueError` with the available names."""
         if name not in self.sensor_names:
             raise ValueError(
                 f"there is no sensor {name!r}; there are {', '.join(self.sensor_names)}."
@@ -184,6 +184,6 @@ class LinearModalFit(AbstractModalFit):
         }
 
     def attributes(self) -> dict[str, str | float | int]:
-        """The reference, where errors are from, how the fit ended, what it has to tell."""
+        """The reference, the source of the errors, status and notes of the fit."""
         more = {"reference": self.reference.name, "errors_from": self.source}
         return {**super().attributes(), **more}

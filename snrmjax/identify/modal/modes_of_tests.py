@@ -1,4 +1,4 @@
-"""Linear modes of what was measured: frequency responses, low-level states or free decays."""
+"""Linear modes from measurements: frequency responses, low-level states or free decays."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -39,16 +39,16 @@ def find_modes(
     progress: Callable[[int, int], None] | None = None,
     **settings: Any,
 ) -> tuple[LinearModalFit | DecayModes, tuple[Fact, ...]]:
-    """Modes of what was measured, and notes on it.
+    """Linear modes of a measurement, and notes.
 
-    Of steady states the lowest level counts, and the next one says whether it was low enough. Where
-    the levels show that a mode depends on its amplitude, they are fitted together, and the modes
-    are those at no amplitude (see `amplitude_dependent_modes`).
+    Of steady states the lowest level is used, and the next one checks whether it was low enough. If
+    the levels show a mode that depends on its amplitude, they are fitted together and the modes are
+    those at zero amplitude (see `amplitude_dependent_modes`).
 
-    Arguments: `level` of steady states in place of the lowest; `base` what the responses are where
-    the reference is the motion of a base; `progress` as for `fit_free_decay`; `settings` those
-    of `fit_linear_modes`, of which free decays take the poles, the highest order and the upper end
-    of the band.
+    Arguments: `level` of steady states in place of the lowest; `base` "absolute" or "relative"
+    responses where the reference is the motion of a base; `progress` as for `fit_free_decay`;
+    `settings` those of `fit_linear_modes`; free decays use the poles, the highest order and the
+    upper end of the band.
     Raises `ValueError` as the fits do.
     Not differentiable: differentiate `snrmjax.model.linear_response`.
     """
@@ -58,10 +58,10 @@ def find_modes(
         of_decays = {name: settings[name] for name in _OF_DECAYS if name in settings}
         return fit_free_decay(source, **of_decays, progress=progress), ()
     if source.base is not None and source.base.motion == "absolute":
-        base = "relative"  # the base's motion is taken away already
+        base = "relative"  # the base motion is subtracted already
     elif source.base is not None and base is None:
         raise ValueError(
-            "these states are of a moving base: say what the sensors record, `--base absolute` "
+            "these states are of a moving base: state what the sensors record, `--base absolute` "
             "or `--base relative`."
         )
     levels = levels_by_velocity(source)
@@ -78,7 +78,7 @@ def find_modes(
         start = None if given else pole_of_states(rows)
         if start is None:
             raise
-        # Few states about one resonance, or one that leans: no pole settles over the order.
+        # Few states about one resonance, or a skewed one: no pole is stable over the order.
         modes = _of_responses(lowest.responses, base, {**asked, "poles": (start,)})
     above = onward[1:]
     phase = settings.get("instrument_phase")
@@ -120,37 +120,37 @@ class StateResponses(NamedTuple):
 
 
 def levels_by_velocity(data: SteadyStates) -> list[int]:
-    """The levels of a test, that of the smallest largest velocity first."""
-    size = np.where(np.asarray(data.measured), np.abs(np.asarray(data.velocity)), 0.0).max(axis=1)
+    """The levels of a test in order of their largest velocity."""
+    speed = np.where(np.asarray(data.measured), np.abs(np.asarray(data.velocity)), 0.0).max(axis=1)
     level = np.asarray(data.level)
-    return sorted(np.unique(level).tolist(), key=lambda number: size[level == number].max())
+    return sorted(np.unique(level).tolist(), key=lambda number: speed[level == number].max())
 
 
 def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
     """The mobilities of one level; states of one frequency are averaged.
 
-    Raises `ValueError` for a level that is not there, for phases that were not measured and for
-    states with neither a force nor a drive voltage.
+    Raises `ValueError` for an unknown level, for phases that were not measured and for states with
+    neither a force nor a drive voltage.
     """
     rows = np.asarray(data.level) == level
     if not rows.any():
         listed = ", ".join(map(str, np.unique(np.asarray(data.level)).tolist()))
         raise ValueError(f"there is no level {level}; there are {listed}.")
     if np.any(np.asarray(data.phase_unknown)[rows]):
-        raise ValueError("modes need phases, but velocities of amplitude alone were measured.")
+        raise ValueError("modes need phases, but only amplitudes of velocities were measured.")
     reference, load, velocity, std, known = over_reference(data, rows)
-    seen, mobility, parts = (
+    measured, mobility, parts = (
         np.isfinite(velocity),
         velocity / load[:, None],
         std / np.abs(load[:, None]),
     )
-    omega, place = np.unique(np.asarray(data.frequency)[rows], return_inverse=True)
+    omega, line = np.unique(np.asarray(data.frequency)[rows], return_inverse=True)
     shape = (velocity.shape[1], len(omega))
     total, count, variance = np.zeros(shape, dtype=complex), np.zeros(shape), np.zeros(shape)
-    for k, row in enumerate(place):
-        total[:, row] += np.where(seen[k], mobility[k], 0.0)
-        count[:, row] += seen[k]
-        variance[:, row] += np.where(seen[k], parts[k] ** 2, 0.0)
+    for k, row in enumerate(line):
+        total[:, row] += np.where(measured[k], mobility[k], 0.0)
+        count[:, row] += measured[k]
+        variance[:, row] += np.where(measured[k], parts[k] ** 2, 0.0)
     values = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     std = np.sqrt(variance) / np.maximum(count, 1)
     responses = frequency_responses(
@@ -169,8 +169,8 @@ def amplitude_dependence(
 ) -> tuple[LinearModalFit, tuple[Fact, ...]]:
     """Whether modes differ between the two lowest levels by more than their errors.
 
-    Where one does, its value at no amplitude may differ from that of the lower level by the change
-    times v₁/(v₂ − v₁), as if it grew with the amplitude: that is the error to add.
+    If so, the change times v₁/(v₂ − v₁), a linear extrapolation to zero amplitude, is added to the
+    error of the lower level.
 
     Arguments: the largest velocity of each level, m/s, the lower first.
     Returns the fit at the lower level with these errors, and notes.
@@ -194,8 +194,8 @@ def amplitude_dependence(
             if abs(change) > allowed:
                 added[row, k] = abs(change) * rest
                 at = {"mode": k + 1, "frequency_hz": omega / HERTZ, "of_damping": row == 1}
-                sizes = {"change": change, "allowed": allowed, "left": float(added[row, k])}
-                notes.append(Fact("amplitude_dependence", **at, **sizes, velocities=velocities))
+                changes = {"change": change, "allowed": allowed, "left": float(added[row, k])}
+                notes.append(Fact("amplitude_dependence", **at, **changes, velocities=velocities))
     if not notes:
         notes.append(Fact("levels_agree"))
     covariance = lowest.mode_covariance.copy()
@@ -204,7 +204,7 @@ def amplitude_dependence(
 
 
 class BaseResponses(NamedTuple):
-    """Relative accelerations over the base's, and their 1σ where a coherence states it."""
+    """Relative accelerations over the base's, and their 1σ from the coherence if stated."""
 
     responses: FrequencyResponses
     std: Float[np.ndarray, "response frequency"] | None  # of real and of imaginary part
@@ -219,10 +219,11 @@ def relative_to_base(
     it is driven by the force −m a at every mass, and z/a = −Σ φΓ/(ω² − Ω² + 2iζωΩ). An absolute
     motion is that plus the base's own, −1/Ω² times the sensor's direction cosine.
 
-    Arguments: one reference that is a displacement, velocity or acceleration; `motion` what the
-    responses are; `along` the cosine between a sensor and the base's motion, 1 where not named.
-    Raises `ValueError` for another number or kind of references, for responses that are no motion
-    and for unknown sensors.
+    Arguments: one reference that is a displacement, velocity or acceleration; `motion` states
+    whether the responses are absolute; `along` the cosine between a sensor and the base's motion, 1
+    where not named.
+    Raises `ValueError` for another number or kind of references, for responses that are not a
+    motion and for unknown sensors.
     """
     if motion not in get_args(SensorMotion):
         raise ValueError(f"the motion must be 'absolute' or 'relative', but is {motion!r}.")
@@ -239,7 +240,7 @@ def relative_to_base(
     reference = responses.references[0]
     keep = responses.frequency > 0
     s = 1j * responses.frequency[keep]
-    turned, spread = [], []
+    relative_values, spread = [], []
     for channel, row, known in zip(
         responses.responses, responses.values[:, 0], responses.coherence[:, 0], strict=True
     ):
@@ -248,12 +249,12 @@ def relative_to_base(
         over = row[keep] * s ** (POWERS[reference.quantity] - POWERS[channel.quantity])
         spread.append(coherence_std(np.abs(over), known[keep], responses.averages))
         of_base = (along or {}).get(channel.name, 1.0) if motion == "absolute" else 0.0
-        turned.append(over - of_base)
+        relative_values.append(over - of_base)
     std = np.array(spread)
     relative = dataclasses.replace(
         responses,
         frequency=responses.frequency[keep],
-        values=np.array(turned)[:, None],
+        values=np.array(relative_values)[:, None],
         coherence=np.full((len(names), 1, int(keep.sum())), np.nan),
         responses=tuple(
             channel._replace(quantity="acceleration", unit="m/s^2", calibration=1.0)

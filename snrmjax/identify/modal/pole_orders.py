@@ -12,22 +12,22 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-_ARC = 0.9 * 2 * np.pi  # of the circle, that the band covers
-_STABLE = 0.2  # of the decay rate: how far a stable pole moves from one order to the next
-_NEAR = 0.5  # of the decay rate: how far poles of one cluster lie apart
-_FLOOR = 2e-5  # of a frequency, below which poles are one
-_FRACTION = 0.3  # of the orders from its first on, that a cluster has
+_ARC = 0.9 * 2 * np.pi  # of the circle, covered by the band
+_STABLE = 0.2  # of the decay rate: largest change of a stable pole from one order to the next
+_NEAR = 0.5  # of the decay rate: largest distance of poles of one cluster
+_FLOOR = 2e-5  # of a frequency, below which poles count as equal
+_FRACTION = 0.3  # smallest fraction of the orders, from its first on, with a pole in a cluster
 _FEWEST_ORDERS = 3
 LIGHTLY_DAMPED = 0.25
-"""Damping ratio, below which a pole of an order may be a mode."""
+"""Damping ratio below which a pole may be a mode."""
 
 
 class PoleOrders(NamedTuple):
-    """Poles of all orders, one row each; see `poles_of_responses` and `poles_of_decay`."""
+    """Poles of all model orders, one entry each; see `poles_of_responses` and `poles_of_decay`."""
 
     order: Int[np.ndarray, " pole"]
     pole: Complex[np.ndarray, " pole"]  # rad/s, imaginary part positive
-    stable: np.ndarray  # whether one of the order below lies near
+    stable: np.ndarray  # whether a pole of the order below is near
     highest: int  # order
 
     @property
@@ -67,7 +67,7 @@ def poles_of_responses(
         for r, s, t in blocks:
             inside = np.linalg.lstsq(r[part, part], s[part, part], rcond=1e-12)[0]
             reduced += t[part, part] - s[part, part].conj().T @ inside
-        # The lowest coefficient is one: poles of noise then lie outside the circle.
+        # The lowest coefficient is one: spurious poles then lie outside the unit circle.
         rest = np.linalg.lstsq(reduced[1:, 1:], -reduced[1:, 0], rcond=1e-14)[0]
         roots = np.roots(np.concatenate([[1.0], rest])[::-1])
         roots = roots[np.abs(roots) > 0]
@@ -80,7 +80,7 @@ def poles_of_responses(
 def gathered(
     by_order: Sequence[tuple[int, Complex[np.ndarray, " pole"]]], highest: int
 ) -> PoleOrders:
-    """Poles of all orders with what is stable among them."""
+    """Poles of all orders, with their stability."""
     stable, before = [], np.empty(0, dtype=complex)
     for _, poles in by_order:
         near = np.abs(poles[:, None] - before) < _STABLE * np.abs(poles.real[:, None])
@@ -95,23 +95,23 @@ def gathered(
 def clusters(
     orders: PoleOrders, band: tuple[float, float] = (0.0, np.inf)
 ) -> Complex[np.ndarray, " cluster"]:
-    """Stable poles that many orders share, each once: lightly damped or growing, in the band.
+    """Clusters of stable poles over the model orders: lightly damped or growing, in the band.
 
-    Means of their clusters by frequency, rad/s; the real part says which decay.
+    Medians of the clusters by frequency, rad/s; the real part is negative for decaying ones.
     """
     ratio = np.abs(orders.damping_ratio)
     use = orders.stable & (ratio < LIGHTLY_DAMPED) & (ratio > 0)
     use &= (orders.natural_frequency >= band[0]) & (orders.natural_frequency <= band[1])
-    place, pole = orders.order[use], orders.pole[use]
+    model_order, pole = orders.order[use], orders.pole[use]
     means: list[complex] = []
     left = np.ones(pole.size, dtype=bool)
     while left.any():
-        rest, at = pole[left], place[left]
+        rest, at = pole[left], model_order[left]
         decay = np.abs(rest.real)
         reach = np.maximum(_NEAR * 0.5 * (decay[:, None] + decay), _FLOOR * np.abs(rest))
         near = (np.abs(rest[:, None] - rest) < reach) & (rest.real[:, None] * rest.real > 0)
-        # The pole with most neighbours, and the nearest of each order, are the next cluster: two
-        # poles of one order are two modes, however near.
+        # The pole with most neighbours and the nearest pole of each order form the next cluster:
+        # two poles of one order are two modes, however near.
         seed = int(np.argmax(near.sum(axis=1)))
         members = _nearest_of_each(at, np.abs(rest - rest[seed]), near[seed])
         count, first = len(np.unique(at[members])), at[members].min()

@@ -1,4 +1,4 @@
-"""What a modal fit takes from frequency responses: one reference, one band, errors of each line."""
+"""Data of a modal fit from frequency responses: one reference, one band, errors of each line."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,16 +14,16 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
 ErrorSource = Literal["stated", "coherence", "residuals"]
-"""Where the weights come from: stated 1σ, coherence, or the residuals themselves."""
+"""Source of the weights: stated 1σ, coherence, or the residuals themselves."""
 
 _FEWEST_LINES = 6
 POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-"""Of iΩ, by which a motion exceeds its displacement."""
+"""Powers of iΩ of a motion relative to the displacement."""
 
-_LEAST_MISSING_COHERENCE = 1e-7  # 1 − γ² that a file's rounding leaves
-_FEWEST_NUMBERS = 12  # of a channel, below which its errors are one size
-_SPREAD = 1e-4  # of the largest response: where the search for the errors' sizes begins
-_SMALLEST = 1e-12  # of a channel's residuals: errors of responses without any
+_LEAST_MISSING_COHERENCE = 1e-7  # 1 − γ² below which it is rounding of the file
+_FEWEST_NUMBERS = 12  # of values of a channel, below which its errors have one standard deviation
+_SPREAD = 1e-4  # of the rms residual: floor of the error model
+_SMALLEST = 1e-12  # relative floor of errors, for noise-free responses
 _SAME_FREQUENCY = 1e-9  # relative
 
 
@@ -33,7 +33,7 @@ class ResponseData(NamedTuple):
     omega: Float[np.ndarray, " line"]  # rad/s
     receptance: Complex[np.ndarray, "channel line"]  # NaN where not measured
     std: Float[np.ndarray, "channel line"]  # 1σ of each part; NaN where the source is residuals
-    powers: tuple[int, ...]  # of iΩ, by which each channel measured its receptance
+    powers: tuple[int, ...]  # of iΩ in the quantity that each channel measured
     channels: tuple[Channel, ...]
     reference: Channel
     source: ErrorSource
@@ -42,17 +42,17 @@ class ResponseData(NamedTuple):
     load: Float[np.ndarray, " line"] | float = 1.0  # of the reference, where motions were measured
 
     @property
-    def measured_size(self) -> Float[np.ndarray, "channel line"]:
-        """|iΩ|^power of each channel, and the load: a receptance's factor to what was measured."""
+    def measured_factor(self) -> Float[np.ndarray, "channel line"]:
+        """|iΩ|^power of each channel times the load: factor from receptance to measured value."""
         return self.load * self.omega ** np.array(self.powers)[:, None]
 
     @property
     def coherence(self) -> Float[np.ndarray, "channel line"]:
-        """The coherence that the 1σ stand for, at the sizes that were measured."""
+        """The coherence equivalent to the 1σ at the measured magnitudes."""
         return 1 / (1 + 2 * (self.averages or 1) * (self.std / np.abs(self.receptance)) ** 2)
 
     def bases(self, *, windowed: bool) -> tuple[tuple[int, ...], Int[np.ndarray, " channel"]]:
-        """Powers of iΩ that need a basis of their own, as under a window, and whose is which."""
+        """Powers of iΩ with separate bases (under a window), and the basis of each channel."""
         if not windowed:
             return (0,), np.zeros(len(self.powers), dtype=int)
         powers = tuple(dict.fromkeys(self.powers))
@@ -69,10 +69,10 @@ def response_data(
 ) -> ResponseData:
     """The lines of a band over one reference, as receptances.
 
-    Arguments: `std` 1σ of real and of imaginary part of each value, SI of what was measured;
+    Arguments: `std` 1σ of real and of imaginary part of each value, SI units of the measurement;
     `reference` the name of a channel where there are several; the band in rad/s.
-    Raises `ValueError` for several references without a name, responses that are no motion, a
-    coherence outside 0 to 1, fewer than six lines in the band, and responses of zeros.
+    Raises `ValueError` for several references without a name, responses that are not a
+    motion, a coherence outside 0 to 1, fewer than six lines in the band, and responses of zeros.
     """
     column = _reference(responses, reference)
     _check_quantities(responses)
@@ -93,7 +93,7 @@ def response_data(
     raw = responses.values[:, column][:, keep]
     for channel, row in zip(responses.responses, raw, strict=True):
         if not np.any(np.nan_to_num(row)):
-            raise ValueError(f"the response {channel.name} is zero or missing all over the band.")
+            raise ValueError(f"the response {channel.name} is zero or missing throughout the band.")
     coherence = responses.coherence[:, column][:, keep]
     bad = np.argwhere((coherence < 0) | (coherence > 1 + 1e-9))
     if bad.size:
@@ -103,13 +103,13 @@ def response_data(
             f"{omega[keep][line] / HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
         )
     powers = tuple(POWERS[channel.quantity] for channel in responses.responses)
-    size = omega[keep] ** np.array(powers)[:, None]
-    turned = raw / (1j * omega[keep]) ** np.array(powers)[:, None]
+    factor = omega[keep] ** np.array(powers)[:, None]
+    receptance = raw / (1j * omega[keep]) ** np.array(powers)[:, None]
     spread, source, notes = _errors(responses, raw, coherence, std, keep)
     return ResponseData(
         omega[keep],
-        turned,
-        spread / size,
+        receptance,
+        spread / factor,
         powers,
         responses.responses,
         responses.references[column],
@@ -120,25 +120,25 @@ def response_data(
 
 
 def joined_responses(parts: Sequence[FrequencyResponses]) -> FrequencyResponses:
-    """Responses of several files of one test side by side, over the same reference.
+    """Responses of several files of one test, over the same reference.
 
-    Raises `ValueError` where frequencies or references differ, or a channel comes twice.
+    Raises `ValueError` if frequencies or references differ or a channel is repeated.
     """
     first = parts[0]
     for part in parts[1:]:
-        place = part.name or "one file"
+        file = part.name or "one file"
         if part.frequency.shape != first.frequency.shape or np.any(
             np.abs(part.frequency - first.frequency) > _SAME_FREQUENCY * first.frequency[-1]
         ):
             raise ValueError(
-                f"responses of one test must share their frequencies, but {place} has "
+                f"responses of one test must share their frequencies, but {file} has "
                 f"{len(part.frequency)} lines to {part.frequency[-1] / HERTZ:.6g} Hz and "
                 f"{first.name or 'the first'} {len(first.frequency)} to "
                 f"{first.frequency[-1] / HERTZ:.6g} Hz."
             )
         if [r.name for r in part.references] != [r.name for r in first.references]:
             raise ValueError(
-                f"responses of one test must share their references, but {place} has "
+                f"responses of one test must share their references, but {file} has "
                 f"{', '.join(r.name for r in part.references)} and {first.name or 'the first'} "
                 f"{', '.join(r.name for r in first.references)}."
             )
@@ -187,7 +187,7 @@ def _errors(
     std: np.ndarray | None,
     keep: np.ndarray,
 ) -> tuple[np.ndarray, ErrorSource, list[Fact]]:
-    """1σ of real and imaginary part, in the unit of what was measured."""
+    """1σ of real and imaginary part, in the measured unit."""
     unknown = np.full(raw.shape, np.nan)
     if std is not None:
         given = np.asarray(std, dtype=float)
@@ -208,23 +208,23 @@ def _errors(
     if np.median(coherence[stated]) > 1 - _LEAST_MISSING_COHERENCE:
         return unknown, "residuals", [Fact("coherence_is_one")]
     if np.median(coherence[stated]) <= 0:
-        raise ValueError("the coherence is zero at most lines: nothing follows the reference.")
+        raise ValueError("the coherence is zero at most lines: no response follows the reference.")
     return coherence_std(np.abs(raw), coherence, responses.averages), "coherence", []
 
 
 def coherence_std(
-    size: Float[np.ndarray, "channel line"],
+    magnitude: Float[np.ndarray, "channel line"],
     coherence: Float[np.ndarray, "channel line"],
     averages: int | None,
 ) -> Float[np.ndarray, "channel line"]:
     """1σ of real and imaginary part of an H1 estimate, |H| √((1 − γ²)/(2 γ² n)).
 
-    Relative only where the number n of averages is not stated (one is taken).
+    Up to a factor if the number n of averages is not stated (one is assumed).
     Reference: Bendat & Piersol, Random Data, 4th ed. (2010), section 9.2,
     doi:10.1002/9781118032428.
     """
     kept = np.clip(coherence, 1e-6, 1 - _LEAST_MISSING_COHERENCE)
-    return size * np.sqrt((1 - kept) / kept / 2 / (averages or 1))
+    return magnitude * np.sqrt((1 - kept) / kept / 2 / (averages or 1))
 
 
 def std_from_residuals(
@@ -232,34 +232,34 @@ def std_from_residuals(
     residuals: Float[np.ndarray, "channel line"],
     fitted: Float[np.ndarray, "channel line"],
 ) -> Float[np.ndarray, "channel line"]:
-    """1σ of each part by σ² = a² + b²|H|² of what was measured, a and b by maximum likelihood.
+    """1σ of each part by σ² = a² + b²|H|² of the measured values, a and b by maximum likelihood.
 
-    Arguments: complex residuals and sizes of the fit, receptances; NaN where not measured.
+    Arguments: complex residuals and fitted receptances; NaN where not measured.
     """
-    size = data.measured_size
+    factor = data.measured_factor
     std = np.full(residuals.shape, np.nan)
     for k in range(len(residuals)):
         good = np.isfinite(residuals[k])
-        left = 0.5 * np.abs(residuals[k][good] * size[k][good]) ** 2
-        model = (np.abs(fitted[k]) * size[k]) ** 2
+        left = 0.5 * np.abs(residuals[k][good] * factor[k][good]) ** 2
+        model = (np.abs(fitted[k]) * factor[k]) ** 2
         floor = max(_SMALLEST**2 * float(model[good].max()), float(np.mean(left)) * _SMALLEST)
         scale = float(np.mean(left)) + floor
         if 2 * good.sum() < _FEWEST_NUMBERS:
-            std[k] = np.sqrt(scale) / size[k]
+            std[k] = np.sqrt(scale) / factor[k]
             continue
         relative = model / np.mean(model[good])
 
-        def unlikely(logs: np.ndarray, of: np.ndarray, at: np.ndarray) -> float:
+        def negative_log_likelihood(logs: np.ndarray, of: np.ndarray, at: np.ndarray) -> float:
             variance = np.exp(logs[0]) + np.exp(logs[1]) * at + _SPREAD**2
             return float(np.sum(np.log(variance) + of / variance))
 
         best = minimize(
-            unlikely,
+            negative_log_likelihood,
             np.log([0.5, 0.5]),
             args=(left / scale, relative[good]),
             method="L-BFGS-B",
             bounds=[(-20.0, 10.0)] * 2,
         )
         variance = np.exp(best.x[0]) + np.exp(best.x[1]) * relative + _SPREAD**2
-        std[k] = np.sqrt(variance * scale) / size[k]
+        std[k] = np.sqrt(variance * scale) / factor[k]
     return std

@@ -1,9 +1,9 @@
-"""Weighted least squares where each channel is linear in its own unknowns, the poles shared.
+"""Weighted least squares with shared poles, each channel linear in its own coefficients.
 
 min over θ and c_i of Σ_i |W_i (y_i − B(θ) c_i)|²: the linear unknowns c_i are eliminated channel by
 channel (variable projection), so that many sensors cost no more than their sum.
 Reference: Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973) 413, doi:10.1137/0710036; covariance of
-residuals that neighbours share: Newey & West, Econometrica 55 (1987) 703, doi:10.2307/1913610.
+neighbouring residuals: Newey & West, Econometrica 55 (1987) 703, doi:10.2307/1913610.
 """
 
 import dataclasses
@@ -16,15 +16,15 @@ from jaxtyping import Float, Int
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
 
 _RULE = StepRule(steps=80, settled=1e-7, damping=1e-4, largest_damping=1e9)
-_LAGS = 30  # rows, over which neighbours' residuals are looked at
-_WHITE = 2.5  # standard errors of a correlation that white noise may well have
+_LAGS = 30  # rows, over which residuals are tested for correlation
+_WHITE = 2.5  # standard errors, below which a correlation counts as that of white noise
 SIGNIFICANT = 4.0
-"""Standard errors of a mode's largest amplitude or residue, without which it is none."""
-_TINY = 1e-150  # of a column's length, below which it is none
+"""Smallest amplitude or residue of a significant mode, in standard errors."""
+_TINY = 1e-150  # norm below which a column counts as zero
 
 
 class TermColumns(NamedTuple):
-    """Columns of the linear unknowns at some θ, and their derivatives.
+    """Columns of the linear unknowns at given θ, and their derivatives.
 
     Rows are `sequences` of equal length one after another (real and imaginary parts of a response).
     """
@@ -34,11 +34,11 @@ class TermColumns(NamedTuple):
 
 
 ColumnsAt = Callable[[Float[np.ndarray, " unknown"]], Sequence[TermColumns]]
-"""The bases at θ, one a group of channels."""
+"""The bases at θ, one for each group of channels."""
 
 
 class ChannelRows(NamedTuple):
-    """Rows of all channels; `groups` says which basis is a channel's."""
+    """Rows of all channels; `groups` is the index of each channel's basis."""
 
     values: Float[np.ndarray, "channel row"]
     weights: Float[np.ndarray, "channel row"]  # 1/σ, 0 where not measured
@@ -47,10 +47,10 @@ class ChannelRows(NamedTuple):
 
 
 class SeparableFit(NamedTuple):
-    """Best θ and c, whitened residuals, and what covariances are made of.
+    """Best θ and c, whitened residuals, and the parts of their covariances.
 
     An error of channel i is δc_i = B_i⁺ε_i − slopes_i δθ. `own` is the covariance of B_i⁺ε_i,
-    `mixed` that of it with δθ.
+    `mixed` its covariance with δθ.
     """
 
     unknowns: Float[np.ndarray, " unknown"]
@@ -63,10 +63,12 @@ class SeparableFit(NamedTuple):
     correlation: Float[np.ndarray, " lag"]  # of neighbouring residuals, from lag one
     status: MinimisationStatus
 
-    def with_variance(self, size: float) -> "SeparableFit":
-        """The same for errors of another variance."""
+    def with_variance(self, variance: float) -> "SeparableFit":
+        """The same with covariances for errors of another variance."""
         return self._replace(
-            covariance=self.covariance * size, own=self.own * size, mixed=self.mixed * size
+            covariance=self.covariance * variance,
+            own=self.own * variance,
+            mixed=self.mixed * variance,
         )
 
     def term_covariance(self, term: int) -> Float[np.ndarray, "channel channel"]:
@@ -90,8 +92,8 @@ def fit_separable(
 ) -> SeparableFit:
     """The weighted least-squares fit and its covariance for errors of unit variance.
 
-    Residuals of neighbouring rows may be correlated (windows, smooth misfits): their correlation,
-    as long as it is significant, widens the covariance. The fit ends when a step lowers the sum of
+    Significant correlation of neighbouring residuals (windows, smooth misfits) widens the
+    covariance. The fit ends when a step lowers the sum of
     squares by less than `settled`.
     """
 
@@ -107,7 +109,7 @@ def fit_separable(
 
 
 class _Compressed(NamedTuple):
-    """Residuals and Jacobian of the projected problem, each channel's rows by their triangle."""
+    """Residuals and Jacobian of the projected problem, each channel reduced by QR."""
 
     residuals: Float[np.ndarray, " row"]
     jacobian: Float[np.ndarray, "row unknown"]
@@ -117,16 +119,16 @@ class _Projected(NamedTuple):
     coefficients: np.ndarray  # term
     inverse: np.ndarray  # term, row: pseudo-inverse of the weighted basis
     slopes: np.ndarray  # row, unknown: weighted derivative of the model at fixed c
-    outside: np.ndarray  # row, unknown: the part of it that no c can follow
+    outside: np.ndarray  # row, unknown: its part outside the column space
     residuals: np.ndarray  # row
 
 
 def _projected(basis: TermColumns, values: np.ndarray, weights: np.ndarray) -> _Projected:
     weighted = basis.columns * weights[:, None]
-    size = np.linalg.norm(weighted, axis=0)
-    size = np.where(size > _TINY, size, 1.0)
-    orthogonal, triangle = np.linalg.qr(weighted / size)
-    inverse = np.linalg.pinv(triangle, rcond=1e-12) @ orthogonal.T / size[:, None]
+    norm = np.linalg.norm(weighted, axis=0)
+    norm = np.where(norm > _TINY, norm, 1.0)
+    orthogonal, triangle = np.linalg.qr(weighted / norm)
+    inverse = np.linalg.pinv(triangle, rcond=1e-12) @ orthogonal.T / norm[:, None]
     rows = values * weights
     coefficients = inverse @ rows
     slopes = np.einsum("urt,t->ru", basis.derivatives, coefficients) * weights[:, None]
@@ -199,7 +201,7 @@ class _Spread(NamedTuple):
 
 
 def _correlation(residuals: np.ndarray, measured: ChannelRows) -> np.ndarray:
-    """Correlations of neighbouring residuals up to the first that white noise may have."""
+    """Correlations of neighbouring residuals up to the first insignificant lag."""
     used = (measured.weights > 0).reshape(len(residuals) * measured.sequences, -1)
     rows = np.where(used, residuals.reshape(used.shape), 0.0)
     length = rows.shape[1]

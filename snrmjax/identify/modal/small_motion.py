@@ -1,10 +1,10 @@
-"""Modes of a free decay at no amplitude, where frequency or damping change as the motion falls.
+"""Modes of a free decay at zero amplitude, where frequency or damping change with amplitude.
 
-The decay is fitted from later and later beginnings, each time from where the motion has fallen to
-half, and from the last one backwards: there the motion is most nearly linear, and what a fit finds
-starts the next earlier one. In each, Schwarz' criterion chooses on which powers of the amplitude
-of the strongest mode its rates depend. The earliest beginning counts that leaves no more than
-noise in what it adds, and whose limit agrees with that of the next later one.
+The decay is fitted from several first samples, each where the motion has halved again, starting
+with the last one: there the motion is most nearly linear, and each fit starts the next earlier one.
+In each, Schwarz' criterion selects the powers of the amplitude of the strongest mode on which its
+rates depend. The result is the earliest part that leaves only noise in the samples it adds and
+agrees with the zero-amplitude limit of the next later part.
 """
 
 from collections.abc import Callable
@@ -26,61 +26,61 @@ from snrmjax.identify.modal.decay_fit import (
 from snrmjax.numerics.units import HERTZ
 
 Candidates = Callable[[Float[np.ndarray, "channel sample"]], list[complex]]
-"""Poles of a part of the record."""
+"""Candidate poles of a part of the record."""
 
-_MEDIAN_OF_POWER = float(np.log(2))  # over the mean, of a spectrum's bins
+_MEDIAN_OF_POWER = float(np.log(2))  # median over mean of the power in a spectrum's bins
 _NOISE_BANDS = 16
-# Halvings of the amplitude of which each takes less time than the one before: of friction.
+# Dry friction: the last halvings of the amplitude take less and less time.
 _FALLS, _SHORTER, _MUCH_LONGER = 3, 0.93, 1.5
-_HALVINGS = 10  # of the amplitude, from the first beginning to the last
+_HALVINGS = 10  # of the amplitude, from the first part to the last
 _FEWEST_SAMPLES, _FEWEST_CYCLES = 60, 8
-_MOST_MODES, _MORE_MODES = 6, 2  # of linear modes, and with a mode that moves
-_STRENGTH = 150.0  # amplitude over 1σ of the noise, of a part's samples together
-_SMOOTHED = 4  # cycles, of the envelope
-# Powers of the amplitude that rates may depend on, in the order in which they are tried.
+_MOST_MODES, _MORE_MODES = 6, 2  # of linear modes, and added to an amplitude-dependent mode
+_STRENGTH = 150.0  # signal-to-noise ratio of a part, all samples together
+_SMOOTHED = 4  # cycles over which the envelope is smoothed
+# Powers of the amplitude on which rates may depend, in the order of trial.
 _POWERS: tuple[tuple[int, ...], ...] = (
     *((), (2,), (1, 2), (2, 4), (1, 2, 4), (2, 4, 6), (1, 2, 4, 6)),
 )
 _FRICTION: tuple[tuple[int, ...], ...] = ((-1,), (-1, 2))
-_BETTER = 6.0  # of Schwarz' criterion
-_MOST_GROWN = 2.0  # of an amplitude's logarithm, from one beginning to an earlier one
-_MOVES = 30.0  # χ² of all that moves with the amplitude, from which on it is not chance
-_LEFT = 1.05  # residuals over the noise, that few samples exceed by three of its standard errors
-_LEFT_OF_MOTION = 1e-5  # of the motion: no less noise is looked for
+_BETTER = 6.0  # significant increase of Schwarz' criterion
+_MOST_GROWN = 2.0  # of a log amplitude, from one part to the next earlier one
+_SIGNIFICANT_CHANGE = 30.0  # χ² of the amplitude dependence
+_LEFT = 1.05  # residuals over noise, to which three standard errors are added
+_LEFT_OF_MOTION = 1e-5  # of the motion: floor of the noise estimate
 _CYCLES_OF_LINE = 10
-_NOT_KNOWN = (0.01, 0.5)  # 1σ over ω and ζ
-_CLOSE = 0.1  # of a frequency, between modes of which one may stand for a change of the other
-_SAME = 0.02  # of a frequency, between a mode of two parts
-_FURTHEST = (0.02, 0.25)  # relative change of ω and of ζ from the last motion recorded to none
+_NOT_KNOWN = (0.01, 0.5)  # largest relative 1σ of ω and of ζ
+_CLOSE = 0.1  # of a frequency: a mode this close may be an artefact of amplitude dependence
+_SAME = 0.02  # of a frequency, for the same mode in two parts
+_LARGEST_CHANGE = (0.02, 0.25)  # relative change of ω and of ζ from the end of the record to rest
 
 
 class PartFit(NamedTuple):
-    """A decay fitted from one beginning on."""
+    """A decay fitted from one sample on."""
 
     first: int  # sample
     seconds: float  # from there to the end
-    found: DecayFit
-    settled: bool  # noise alone is left in what the next later part does not have
-    moves: float  # χ² of what moves with the amplitude
-    spread: Float[np.ndarray, "2"]  # 1σ of ω and ζ of the leading mode by the choice of powers
+    fitted: DecayFit
+    settled: bool  # only noise is left in the samples before the next later part
+    change: float  # χ² of the amplitude dependence
+    spread: Float[np.ndarray, "2"]  # 1σ of ω and ζ of the leading mode from the choice of powers
 
     @property
-    def bent(self) -> bool:
-        """Whether rates move with the amplitude."""
-        return self.moves > _MOVES
+    def depends_on_amplitude(self) -> bool:
+        """Whether rates depend significantly on the amplitude."""
+        return self.change > _SIGNIFICANT_CHANGE
 
     def limit(self) -> tuple[np.ndarray, np.ndarray]:
-        """ω and ζ of the leading mode at no amplitude, and their 1σ."""
-        k, n = self.found.form.leading, self.found.form.n_modes
+        """ω and ζ of the leading mode at zero amplitude, and their 1σ."""
+        k, n = self.fitted.form.leading, self.fitted.form.n_modes
         rows = [k, n + k]
-        std = np.sqrt(np.diag(self.found.fit.covariance)[rows])
-        return self.found.unknowns[rows], np.hypot(std, self.spread)
+        std = np.sqrt(np.diag(self.fitted.fit.covariance)[rows])
+        return self.fitted.unknowns[rows], np.hypot(std, self.spread)
 
 
 def noise_of_channels(values: Float[np.ndarray, "channel sample"]) -> Float[np.ndarray, " channel"]:
-    """1σ of noise that is white but for what a filter took out of it, by medians of the spectrum.
+    """1σ of white noise, possibly low-passed, from medians of the spectrum.
 
-    In bands far below the others a filter has taken it; bands above them hold modes.
+    Bands far below the median level are filtered; bands above it contain modes.
     """
     window = np.hanning(values.shape[1])
     spectrum = np.fft.rfft((values - values.mean(axis=1, keepdims=True)) * window, axis=1)
@@ -97,7 +97,7 @@ def noise_of_channels(values: Float[np.ndarray, "channel sample"]) -> Float[np.n
 def envelope(
     values: Float[np.ndarray, "channel sample"], noise: Float[np.ndarray, " channel"], rate: float
 ) -> tuple[Float[np.ndarray, " sample"], float]:
-    """Amplitude over the noise that is not exceeded later, and the strongest frequency in rad/s."""
+    """Monotonic envelope over the noise, and the strongest frequency in rad/s."""
     from scipy.ndimage import uniform_filter1d
 
     away = values - np.median(values, axis=1, keepdims=True)
@@ -112,26 +112,26 @@ def envelope(
 def is_linear(
     values: Float[np.ndarray, "channel sample"],
     time: Float[np.ndarray, " sample"],
-    found: DecayFit,
+    fitted: DecayFit,
     noise: Float[np.ndarray, " channel"],
 ) -> bool:
-    """Whether linear modes leave noise alone, and rates that move with the amplitude no less."""
-    if not _settled(found, noise):
+    """Whether linear modes leave only noise, and amplitude-dependent rates fit no better."""
+    if not _settled(fitted, noise):
         return False
-    found = _leading(found, time)
-    moved = [
+    fitted = _leading(fitted, time)
+    trials = [
         one
-        for base in (found, *_without_close(found, values, time))
+        for base in (fitted, *_without_close(fitted, values, time))
         for one in _with_better_powers(base, values, time)
     ]
-    return max(one.information for one in moved) < found.information + _BETTER
+    return max(one.information for one in trials) < fitted.information + _BETTER
 
 
-def left_by_linear_modes(
-    parts: list[PartFit], found: DecayFit, noise: Float[np.ndarray, " channel"]
+def nonlinear_before_last_part(
+    parts: list[PartFit], fitted: DecayFit, noise: Float[np.ndarray, " channel"]
 ) -> bool:
-    """Whether linear modes leave noise alone of a later part, but not of the whole record."""
-    return parts[-1].settled and not parts[0].settled and not _settled(found, noise)
+    """Whether linear modes explain a later part within noise, but not the whole record."""
+    return parts[-1].settled and not parts[0].settled and not _settled(fitted, noise)
 
 
 def parts_of_decay(
@@ -141,15 +141,15 @@ def parts_of_decay(
     noise: Float[np.ndarray, " channel"],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[PartFit]:
-    """Fits from all beginnings, the earliest first.
+    """Fits of all parts, the earliest first.
 
-    They end at the first part that leaves more than noise where a later one left noise alone.
-    `progress` is called with how many beginnings of how many are done.
+    They stop at the first part with more than noise left where the next later one left only noise.
+    `progress` is called with the number of finished parts and their total.
     """
-    size, omega = envelope(values, noise, rate)
-    begins = _begins(size, omega, rate)
-    if _halves_faster_and_faster(begins):
-        last = begins[-_FALLS], omega  # the motion may have stopped since
+    amplitude, omega = envelope(values, noise, rate)
+    begins = _begins(amplitude, omega, rate)
+    if _halving_accelerates(begins):
+        last = begins[-_FALLS], omega  # the motion may have stopped afterwards
         why = "its damping grows as the motion falls, as dry friction has it"
         raise ValueError(_refusal([], last, values, rate, why))
     parts: list[PartFit] = []
@@ -157,22 +157,24 @@ def parts_of_decay(
         part = values[:, first:]
         time = np.arange(part.shape[1]) / rate
         later = parts[-1] if parts else None
-        fitted = _of_part(part, time, candidates, later, noise)
+        fit_and_spread = _of_part(part, time, candidates, later, noise)
         if progress is not None:
             progress(number, len(begins))
-        if fitted is None:
+        if fit_and_spread is None:
             continue
-        found, spread = fitted
-        added = found.residuals[:, : None if later is None else later.first - first]
+        fitted, spread = fit_and_spread
+        added = fitted.residuals[:, : None if later is None else later.first - first]
         settled = _of_noise(added, noise)
-        parts.append(PartFit(first, float(time[-1]), found, settled, _moves(found), spread))
+        parts.append(
+            PartFit(first, float(time[-1]), fitted, settled, _chi_square_of_change(fitted), spread)
+        )
         if later is not None and later.settled and not settled:
             break
     return parts[::-1]
 
 
-def _halves_faster_and_faster(begins: list[int]) -> bool:
-    """Whether the last halvings take less and less time, which small motion does not."""
+def _halving_accelerates(begins: list[int]) -> bool:
+    """Whether the last halvings take less and less time, unlike viscously damped motion."""
     times = np.diff(begins)
     if len(times) < _FALLS:
         return False
@@ -182,12 +184,16 @@ def _halves_faster_and_faster(begins: list[int]) -> bool:
     )
 
 
-def _begins(size: np.ndarray, omega: float, rate: float) -> list[int]:
+def _begins(amplitude: np.ndarray, omega: float, rate: float) -> list[int]:
     begins = [0]
     fewest = max(_FEWEST_SAMPLES, _FEWEST_CYCLES * HERTZ / omega * rate)
     for k in range(1, _HALVINGS + 1):
-        first = int(np.argmax(size <= size[0] * 0.5**k)) if size[-1] <= size[0] * 0.5**k else 0
-        rest = size[first:]
+        first = (
+            int(np.argmax(amplitude <= amplitude[0] * 0.5**k))
+            if amplitude[-1] <= amplitude[0] * 0.5**k
+            else 0
+        )
+        rest = amplitude[first:]
         if not first or len(rest) < fewest or np.sqrt(np.sum(rest**2) / 2) < _STRENGTH:
             break
         if first > begins[-1]:
@@ -196,7 +202,7 @@ def _begins(size: np.ndarray, omega: float, rate: float) -> list[int]:
 
 
 def _earlier(later: DecayFit, seconds: float) -> np.ndarray:
-    """Its unknowns, in units of the amplitude that its leading mode had some time before."""
+    """Its unknowns, in units of the leading mode's amplitude at a time `seconds` earlier."""
     form, n, k = later.form, later.form.n_modes, later.form.leading
     unknowns, powers = later.unknowns.copy(), np.array(form.powers)
     decay, grown, steps = unknowns[2 * n : 2 * n + len(powers)], 0.0, 200
@@ -214,49 +220,49 @@ def _of_part(
     later: PartFit | None,
     noise: np.ndarray,
 ) -> tuple[DecayFit, np.ndarray] | None:
-    """The fit of a part, and how far the choice of powers moves its limit."""
+    """The fit of a part, and the effect of the choice of powers on its limit."""
     plain = None
-    if later is not None and later.bent:
-        # What moves at a smaller amplitude moves here.
-        start = _earlier(later.found, time[-1] - later.seconds)
-        base = with_harmonics(part, time, fit_waves(part, time, start, later.found.form))
+    if later is not None and later.depends_on_amplitude:
+        # Rates that depend on a smaller amplitude do so here.
+        start = _earlier(later.fitted, time[-1] - later.seconds)
+        base = with_harmonics(part, time, fit_waves(part, time, start, later.fitted.form))
     else:
         plain = with_modes(part, time, candidates(part), most=_MOST_MODES)
         if plain is None:
             return None
         plain = _leading(plain, time)
-        base = _alone(plain, part, time)
-    moved = _with_better_powers(base, part, time)
+        base = _leading_mode_only(plain, part, time)
+    trials = _with_better_powers(base, part, time)
     if plain is not None and plain.form.n_modes > 1 and _settled(plain, noise):
-        moved += _with_better_powers(plain, part, time)
-    found = max(moved, key=lambda one: one.information)
-    if not _settled(found, noise):
-        most = found.form.n_modes + _MORE_MODES
-        found = with_modes(part, time, candidates(found.residuals), found, most) or found
-    found = _without_needless(found, part, time)
+        trials += _with_better_powers(plain, part, time)
+    fitted = max(trials, key=lambda one: one.information)
+    if not _settled(fitted, noise):
+        most = fitted.form.n_modes + _MORE_MODES
+        fitted = with_modes(part, time, candidates(fitted.residuals), fitted, most) or fitted
+    fitted = _without_needless(fitted, part, time)
     if plain is not None and (
-        plain.information + _BETTER > found.information or not found.form.powers
+        plain.information + _BETTER > fitted.information or not fitted.form.powers
     ):
-        found = plain
-    return found, _spread_of(moved, found)
+        fitted = plain
+    return fitted, _spread_of(trials, fitted)
 
 
-def _without_needless(found: DecayFit, part: np.ndarray, time: np.ndarray) -> DecayFit:
-    """Without linear modes beside one that moves, where that loses nothing."""
-    lead = found.natural_frequency[found.form.leading]
-    for omega in found.natural_frequency[np.argsort(found.energy(time))]:
-        mode = int(np.argmin(np.abs(found.natural_frequency - omega)))
-        if omega == lead or mode == found.form.leading or not found.form.powers:
+def _without_needless(fitted: DecayFit, part: np.ndarray, time: np.ndarray) -> DecayFit:
+    """Without linear modes next to an amplitude-dependent one that do not improve the fit."""
+    lead = fitted.natural_frequency[fitted.form.leading]
+    for omega in fitted.natural_frequency[np.argsort(fitted.energy(time))]:
+        mode = int(np.argmin(np.abs(fitted.natural_frequency - omega)))
+        if omega == lead or mode == fitted.form.leading or not fitted.form.powers:
             continue
-        less = without_mode(part, time, found, mode)
-        if less.information > found.information:
-            found = less
-    return found
+        less = without_mode(part, time, fitted, mode)
+        if less.information > fitted.information:
+            fitted = less
+    return fitted
 
 
-def _settled(found: DecayFit, noise: np.ndarray) -> bool:
-    """Whether noise alone is left."""
-    return _of_noise(found.residuals, noise)
+def _settled(fitted: DecayFit, noise: np.ndarray) -> bool:
+    """Whether only noise is left."""
+    return _of_noise(fitted.residuals, noise)
 
 
 def _of_noise(residuals: np.ndarray, noise: np.ndarray) -> bool:
@@ -265,57 +271,57 @@ def _of_noise(residuals: np.ndarray, noise: np.ndarray) -> bool:
 
 
 def _with_better_powers(base: DecayFit, part: np.ndarray, time: np.ndarray) -> list[DecayFit]:
-    """Fits of more and more powers of the amplitude, until two in a row are not better."""
-    moved, since = [base], 0
+    """Fits of more and more powers of the amplitude, until two in a row are no better."""
+    trials, since = [base], 0
     for powers in _POWERS[_POWERS.index(base.form.powers) + 1 :]:
-        better = max(one.information for one in moved) + _BETTER
+        better = max(one.information for one in trials) + _BETTER
         tried = with_harmonics(part, time, _with_powers(base, powers, part, time))
-        moved.append(tried)
+        trials.append(tried)
         since = 0 if tried.information > better else since + 1
         if since == 2:
             break
-    return moved
+    return trials
 
 
-def _spread_of(moved: list[DecayFit], found: DecayFit) -> np.ndarray:
-    """1σ of ω and ζ of the leading mode over fits of other powers, as probable as they are."""
-    k, n = found.form.leading, found.form.n_modes
+def _spread_of(trials: list[DecayFit], fitted: DecayFit) -> np.ndarray:
+    """1σ of ω and ζ of the leading mode over fits of other powers, weighted by probability."""
+    k, n = fitted.form.leading, fitted.form.n_modes
     rows, total, square = [k, n + k], 1.0, np.zeros(2)
-    for one in moved:
-        if one.form.n_modes == n and one.form.leading == k and one is not found:
-            weight = float(np.exp(min((one.information - found.information) / 2, 0.0)))
-            square = square + weight * (one.unknowns[rows] - found.unknowns[rows]) ** 2
+    for one in trials:
+        if one.form.n_modes == n and one.form.leading == k and one is not fitted:
+            weight = float(np.exp(min((one.information - fitted.information) / 2, 0.0)))
+            square = square + weight * (one.unknowns[rows] - fitted.unknowns[rows]) ** 2
             total += weight
     return np.sqrt(square / total)
 
 
-def _alone(found: DecayFit, part: np.ndarray, time: np.ndarray) -> DecayFit:
+def _leading_mode_only(fitted: DecayFit, part: np.ndarray, time: np.ndarray) -> DecayFit:
     """The leading mode without the others."""
-    k, n = found.form.leading, found.form.n_modes
+    k, n = fitted.form.leading, fitted.form.n_modes
     if n == 1:
-        return found
-    return fit_waves(part, time, found.unknowns[[k, n + k]], WaveForm(1))
+        return fitted
+    return fit_waves(part, time, fitted.unknowns[[k, n + k]], WaveForm(1))
 
 
-def _without_close(found: DecayFit, part: np.ndarray, time: np.ndarray) -> list[DecayFit]:
-    """The fit without modes close to the leading one and its harmonics, where there are some.
+def _without_close(fitted: DecayFit, part: np.ndarray, time: np.ndarray) -> list[DecayFit]:
+    """The fit without modes close to the leading one and its harmonics, if there are any.
 
-    Several linear modes beside each other can stand for one whose rates move.
+    Several close linear modes can mimic one whose rates depend on its amplitude.
     """
-    n, k = found.form.n_modes, found.form.leading
-    ratio = found.natural_frequency / found.natural_frequency[k]
+    n, k = fitted.form.n_modes, fitted.form.leading
+    ratio = fitted.natural_frequency / fitted.natural_frequency[k]
     order = np.clip(np.round(ratio), 1, 3)
     kept = (np.abs(ratio / order - 1) > _CLOSE) | (np.arange(n) == k)
     if kept.all():
         return []
     form = WaveForm(int(kept.sum()), leading=int(kept[:k].sum()))
-    return [fit_waves(part, time, found.unknowns[: 2 * n][np.tile(kept, 2)], form, found.scale)]
+    return [fit_waves(part, time, fitted.unknowns[: 2 * n][np.tile(kept, 2)], form, fitted.scale)]
 
 
-def _leading(found: DecayFit, time: np.ndarray) -> DecayFit:
-    """With the strongest mode as the one that may move."""
-    strongest = int(np.argmax(found.energy(time)))
-    return found._replace(form=found.form._replace(leading=strongest))
+def _leading(fitted: DecayFit, time: np.ndarray) -> DecayFit:
+    """With the strongest mode as the one that may depend on its amplitude."""
+    strongest = int(np.argmax(fitted.energy(time)))
+    return fitted._replace(form=fitted.form._replace(leading=strongest))
 
 
 def _with_powers(
@@ -325,8 +331,8 @@ def _with_powers(
     terms = np.zeros((2, len(powers)))
     for column, power in enumerate(powers):
         if power in base.form.powers:
-            place = 2 * n + base.form.powers.index(power)
-            terms[:, column] = base.unknowns[place], base.unknowns[place + count]
+            index = 2 * n + base.form.powers.index(power)
+            terms[:, column] = base.unknowns[index], base.unknowns[index + count]
     form = base.form._replace(powers=powers)
     unknowns = np.concatenate([base.unknowns[: 2 * n], terms.ravel()])
     return fit_waves(part, time, unknowns, form, base.scale)
@@ -335,15 +341,14 @@ def _with_powers(
 def small_motion(
     parts: list[PartFit], values: Float[np.ndarray, "channel sample"], rate: float
 ) -> tuple[PartFit, Bool[np.ndarray, " mode"]]:
-    """The part and fit whose limit of small motion counts, and which of its modes are modes.
+    """The part whose fit gives the limit of small motion, and which of its modes are accepted.
 
-    Beside the leading one those that the next later part has too: what a mode that moves leaves
-    unexplained is no mode.
-
-    Its 1σ holds the choice of powers and what the next later part says.
-    Raises `ValueError` where rates move with the amplitude and the limit is not in the record.
+    Accepted are the leading mode and those also present in the next later part: residuals of an
+    amplitude-dependent mode can appear as modes. The 1σ includes the choice of powers and the
+    difference from the next later part.
+    Raises `ValueError` if rates depend on the amplitude and the limit is not in the record.
     """
-    moving = [part for part in parts if part.bent]
+    dependent = [part for part in parts if part.depends_on_amplitude]
     last = parts[-1].first, float(parts[-1].limit()[0][0])
     chosen: PartFit | None = None
     before: PartFit | None = None
@@ -360,25 +365,25 @@ def small_motion(
         raise ValueError(_refusal(parts, last, values, rate, "no part of it is explained"))
     here = values[:, chosen.first :]
     time = np.arange(here.shape[1]) / rate
-    if moving and not chosen.found.form.powers:
-        # What moves at larger amplitudes may move a little here: no power at all is no choice.
-        moved = _with_powers(chosen.found, moving[-1].found.form.powers, here, time)
-        chosen = chosen._replace(found=moved)
-    found = chosen.found
-    rubbing = [_with_powers(found, powers, here, time) for powers in _FRICTION]
-    if max(one.information for one in rubbing) > found.information + _BETTER:
+    if dependent and not chosen.fitted.form.powers:
+        # Rates that depend on larger amplitudes may do so slightly here: powers are kept.
+        refit = _with_powers(chosen.fitted, dependent[-1].fitted.form.powers, here, time)
+        chosen = chosen._replace(fitted=refit)
+    fitted = chosen.fitted
+    with_friction = [_with_powers(fitted, powers, here, time) for powers in _FRICTION]
+    if max(one.information for one in with_friction) > fitted.information + _BETTER:
         why = "its damping grows as the motion falls, as dry friction has it"
         raise ValueError(_refusal(parts, last, values, rate, why))
     value, std = chosen.limit()
-    change = np.abs(_at_the_end(found, time) / value - 1)
-    if value[1] <= 0 or np.any(change > _FURTHEST) or np.any(std / value > _NOT_KNOWN):
-        why = "they are still changing where it ends or drowns in noise"
+    change = np.abs(_at_the_end(fitted, time) / value - 1)
+    if value[1] <= 0 or np.any(change > _LARGEST_CHANGE) or np.any(std / value > _NOT_KNOWN):
+        why = "they are still changing where it ends or disappears in noise"
         raise ValueError(_refusal(parts, last, values, rate, why))
-    kept = significant(found) & (found.damping_ratio > 0)
+    kept = significant(fitted) & (fitted.damping_ratio > 0)
     if before is not None:
-        later = before.found.natural_frequency
-        kept &= np.abs(found.natural_frequency[:, None] / later - 1).min(axis=1) < _SAME
-    kept[found.form.leading] = True
+        later = before.fitted.natural_frequency
+        kept &= np.abs(fitted.natural_frequency[:, None] / later - 1).min(axis=1) < _SAME
+    kept[fitted.form.leading] = True
     return chosen, kept
 
 
@@ -389,13 +394,13 @@ def _refusal(
     rate: float,
     why: str,
 ) -> str:
-    """That the decay is not linear, why its limit is not known, and what part is linear.
+    """Message: the decay is not linear, why its limit is not known, and which part is linear.
 
-    `last_begin` is the sample of the last beginning and a frequency in rad/s near the mode's.
+    `last_begin` is the first sample of the last part and a frequency in rad/s near the mode's.
     """
     begin, omega = last_begin
     first, last = (frequency_at(values, at, rate, omega) for at in (0, begin))
-    linear = [part for part in parts if not part.bent and part.settled]
+    linear = [part for part in parts if not part.depends_on_amplitude and part.settled]
     words = "no part of the record is linear within noise"
     if linear:
         (natural, ratio), (std, ratio_std) = linear[0].limit()
@@ -408,43 +413,45 @@ def _refusal(
     return (
         "the decay is not that of linear modes: frequency or damping change as the motion falls "
         f"({first:.5g} Hz at the largest value, {last:.5g} Hz "
-        f"{begin / rate:.4g} s later), and {why}, so that their values at no amplitude "
-        f"are not known. {words[0].upper()}{words[1:]}. A longer record with less noise reaches "
-        "smaller motion; `snrmjax compare` gives frequency and damping over the amplitude."
+        f"{begin / rate:.4g} s later), and {why}, so that their values at zero "
+        f"amplitude are not known. {words[0].upper()}{words[1:]}. A longer record with less noise "
+        "reaches smaller motion; `snrmjax compare` gives frequency and damping over the amplitude."
     )
 
 
 def frequency_at(
     values: Float[np.ndarray, "channel sample"], first: int, rate: float, omega: float
 ) -> float:
-    """The strongest line of some cycles of `omega` from a sample on, in Hz."""
+    """Frequency (Hz) of the strongest line over some cycles of `omega` from a sample on."""
     length = int(_CYCLES_OF_LINE * HERTZ / omega * rate)
     part = values[:, first : first + length]
     part = part - part.mean(axis=1, keepdims=True)
-    size = 16 * part.shape[1]
-    power = np.sum(np.abs(np.fft.rfft(part * np.hanning(part.shape[1]), size, axis=1)) ** 2, axis=0)
-    return float(np.argmax(power)) * rate / size
+    padded = 16 * part.shape[1]
+    power = np.sum(
+        np.abs(np.fft.rfft(part * np.hanning(part.shape[1]), padded, axis=1)) ** 2, axis=0
+    )
+    return float(np.argmax(power)) * rate / padded
 
 
-def _at_the_end(found: DecayFit, time: np.ndarray) -> np.ndarray:
+def _at_the_end(fitted: DecayFit, time: np.ndarray) -> np.ndarray:
     """ω and ζ of the leading mode at the last sample."""
-    n, k, moving = found.form.n_modes, found.form.leading, len(found.form.powers)
-    column = decaying_columns(time, found.unknowns, found.form).columns[:, [k, n + k]]
-    size = float(np.hypot(*column[-1]))
-    by_power = size ** np.array(found.form.powers, dtype=float)
-    decay, turn = found.unknowns[2 * n :].reshape(2, moving) @ by_power
-    omega, ratio = found.unknowns[[k, n + k]]
+    n, k, n_powers = fitted.form.n_modes, fitted.form.leading, len(fitted.form.powers)
+    column = decaying_columns(time, fitted.unknowns, fitted.form).columns[:, [k, n + k]]
+    amplitude = float(np.hypot(*column[-1]))
+    by_power = amplitude ** np.array(fitted.form.powers, dtype=float)
+    decay, rotation = fitted.unknowns[2 * n :].reshape(2, n_powers) @ by_power
+    omega, ratio = fitted.unknowns[[k, n + k]]
     rate = omega * ratio + decay
-    natural = float(np.hypot(omega * np.sqrt(1 - ratio**2) + turn, rate))
+    natural = float(np.hypot(omega * np.sqrt(1 - ratio**2) + rotation, rate))
     return np.array([natural, rate / natural])
 
 
-def _moves(found: DecayFit) -> float:
-    rows = slice(2 * found.form.n_modes, None)
-    terms = found.unknowns[rows]
+def _chi_square_of_change(fitted: DecayFit) -> float:
+    rows = slice(2 * fitted.form.n_modes, None)
+    terms = fitted.unknowns[rows]
     if not terms.size:
         return 0.0
-    covariance = found.fit.covariance[rows, rows]
+    covariance = fitted.fit.covariance[rows, rows]
     scale = np.sqrt(np.diag(covariance))
     scaled = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-8, hermitian=True)
     return float(terms / scale @ scaled @ (terms / scale))

@@ -1,4 +1,4 @@
-"""Weighted fits of modes to responses: weights that settle, and the result with its errors."""
+"""Weighted fits of modes to responses: iterated weights, and the result with its errors."""
 
 import dataclasses
 from typing import NamedTuple
@@ -29,11 +29,11 @@ from snrmjax.identify.modal.separable_fit import (
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
-_FEW_LINES = 8.0  # in the half-power band, below which leakage may count
-_BIASED = 0.01  # relative bias of damping that is worth a note
-_TURNED = np.radians(5.0)  # mean phase that is worth a note
-_PHASE_STDS = 3.0  # standard errors of a mean phase, below which it may be none
-_MISFIT = 1.5  # rms residual over stated σ that is worth a note
+_FEW_LINES = 8.0  # in the half-power band, below which leakage may matter
+_BIASED = 0.01  # relative bias of damping that gives a note
+_LARGE_PHASE = np.radians(5.0)  # mean phase that gives a note
+_PHASE_STDS = 3.0  # smallest significant mean phase, in standard errors
+_MISFIT = 1.5  # rms residual over stated σ that gives a note
 
 
 def complex_residues(
@@ -43,9 +43,9 @@ def complex_residues(
     std: Float[np.ndarray, "channel line"],
     rank: Int[np.ndarray, " mode"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Modal phase collinearity, mean phase (rad) away from real and its 1σ, of every mode.
+    """Modal phase collinearity, mean phase (rad) of the residue and its 1σ, of every mode.
 
-    Of residues A + iB from a linear fit with terms iΩB/ω beside A, at the fitted poles.
+    Of residues A + iB from a linear fit with additional terms iΩB/ω, at the fitted poles.
     """
     natural = unpacked(fit.unknowns, settings)[0]
     n, lines = len(natural), len(data.omega)
@@ -60,14 +60,14 @@ def complex_residues(
     for k, row in enumerate(values):
         weight = np.tile(np.where(good[k], 1 / std[k], 0.0), 2)
         weighted = both * weight[:, None]
-        size = np.linalg.norm(weighted, axis=0)
-        inverse = np.linalg.pinv(weighted / size, rcond=1e-10) / size[:, None]
+        norm = np.linalg.norm(weighted, axis=0)
+        inverse = np.linalg.pinv(weighted / norm, rcond=1e-10) / norm[:, None]
         both_parts = inverse @ (row * weight)
         residue[k] = both_parts[:n] + 1j * both_parts[-n:]
         spread[k] = np.linalg.norm(inverse[-n:], axis=1)
     collinearity, angle = phase_collinearity(residue)
-    size = np.maximum(np.sum(np.abs(residue) ** 2, axis=0), 1e-300)
-    angle_std = np.sqrt(np.sum((residue.real * spread) ** 2, axis=0)) / size
+    square = np.maximum(np.sum(np.abs(residue) ** 2, axis=0), 1e-300)
+    angle_std = np.sqrt(np.sum((residue.real * spread) ** 2, axis=0)) / square
     return collinearity[rank], angle[rank], angle_std[rank]
 
 
@@ -89,8 +89,8 @@ def leakage_bias(
 ) -> Float[np.ndarray, " mode"]:
     """Relative errors of the damping ratios under Hann's window where leakage is not modelled.
 
-    The fitted modes are seen through a window of one over the line spacing, and fitted with the
-    same weights without it. Of averages of stationary random excitation.
+    The fitted modes are windowed over one over the line spacing and fitted again with the same
+    weights without a window. For averages of stationary random excitation.
     """
     spacing = float(np.median(np.diff(data.omega)))
     through = settings._replace(window_time=2 * np.pi / spacing)
@@ -120,7 +120,7 @@ def fit_notes(
     fit: SeparableFit,
     rank: Int[np.ndarray, " mode"],
 ) -> list[Fact]:
-    """What the fit assumes and the data do not keep."""
+    """Notes on violated assumptions of the fit."""
     notes = []
     averaged = data.source == "coherence" or data.averages is not None
     few = modes.lines_in_band < _FEW_LINES
@@ -134,9 +134,9 @@ def fit_notes(
             )
     for k, (phase, std) in enumerate(zip(modes.mean_phase, modes.mean_phase_std, strict=True)):
         at = {"mode": k + 1, "frequency_hz": hertz[k]}
-        if abs(phase) > max(_TURNED, _PHASE_STDS * std):
-            turn = {"phase_deg": float(np.degrees(phase)), "std_deg": float(np.degrees(std))}
-            notes.append(Fact("residues_turned", **at, **turn, phase_was_free=settings.phase))
+        if abs(phase) > max(_LARGE_PHASE, _PHASE_STDS * std):
+            phases = {"phase_deg": float(np.degrees(phase)), "std_deg": float(np.degrees(std))}
+            notes.append(Fact("residues_turned", **at, **phases, phase_was_free=settings.phase))
         if modes.collinearity[k] < REAL:
             notes.append(Fact("complex_mode", **at, collinearity=float(modes.collinearity[k])))
     notes += [
@@ -152,15 +152,15 @@ def fit_notes(
 
 
 MOST_DAMPED = 0.9
-"""Damping ratio beyond which a fit finds no mode."""
+"""Largest damping ratio of a fitted mode."""
 _ROUNDS = 3  # of fits and weights
 
 
 def line_weights(data: ResponseData) -> Float[np.ndarray, "channel line"]:
-    """1/σ of receptances; of one size for all that a channel measured where σ is unknown."""
+    """1/σ of receptances; one σ for all measured values of a channel where unknown."""
     good = np.isfinite(data.receptance)
-    size = data.measured_size
-    rough = np.sqrt(np.nanmean(np.abs(data.receptance * size) ** 2, axis=1))[:, None] / size
+    factor = data.measured_factor
+    rough = np.sqrt(np.nanmean(np.abs(data.receptance * factor) ** 2, axis=1))[:, None] / factor
     std = np.where(np.isfinite(data.std), data.std, 1e-2 * rough)
     return np.where(good, 1 / std, 0.0)
 
@@ -171,9 +171,9 @@ def filled_receptance(data: ResponseData) -> Complex[np.ndarray, "channel line"]
 
 
 class FitSpread(NamedTuple):
-    """Errors that a fit was weighted by, and what its residuals make of stated ones."""
+    """Errors used as weights, and the rms residuals over the stated ones."""
 
-    std: Float[np.ndarray, "channel line"]  # that weighted the last fit
+    std: Float[np.ndarray, "channel line"]  # weights of the last fit
     misfit: Float[np.ndarray, " channel"]
 
 
@@ -184,15 +184,17 @@ def weighted_fit(
     std: np.ndarray,
     rounds: int = _ROUNDS,
 ) -> tuple[SeparableFit, FitSpread]:
-    """The fit from given unknowns (see `receptance_bases`) and 1σ, its weights settled.
+    """The fit from given unknowns (see `receptance_bases`) and 1σ, with iterated weights.
 
-    Each round takes the size of the errors from the residuals of the one before.
+    Each round scales the errors by the residuals of the previous one.
     """
     good = np.isfinite(data.receptance)
     values = real_and_imaginary(filled_receptance(data))
     powers, groups = data.bases(windowed=settings.window_time is not None)
     n, band = settings.modes_of(unknowns), (data.omega.min(), data.omega.max())
-    most = np.ones(settings.n_terms)  # of the natural frequency squared, over the amplitudes
+    most = np.ones(
+        settings.n_terms
+    )  # change of the squared natural frequency over the amplitudes, relative
     low = np.concatenate([np.full(n, 0.5 * band[0]), np.full(n, -MOST_DAMPED), -most])
     high = np.concatenate([np.full(n, 2 * band[1]), np.full(n, MOST_DAMPED), most])
     if settings.phase:
@@ -203,7 +205,7 @@ def weighted_fit(
 
     coherence = data.coherence if data.source == "coherence" else None
     scale = np.ones(len(values))
-    for turn in range(rounds):
+    for number in range(rounds):
         weights = np.where(good, 1 / (std * scale[:, None]), 0.0)
         measured = ChannelRows(values, np.tile(weights, (1, 2)), groups, 2)
         fit = fit_separable(basis_at, measured, unknowns, (low, high))
@@ -212,24 +214,24 @@ def weighted_fit(
         lines = len(data.omega)
         residuals = np.where(good, left[:, :lines] + 1j * left[:, lines:], np.nan)
         fitted = filled_receptance(data) - np.nan_to_num(residuals)
-        if turn == rounds - 1:
+        if number == rounds - 1:
             break
         if data.source == "residuals":
             std, scale = std_from_residuals(data, residuals, fitted), np.ones(len(values))
         elif coherence is not None:
-            # Weights that use the measured size prefer lines that are too small by chance.
+            # Fitted magnitudes: weights from measured ones favour lines too small by chance.
             std = coherence_std(np.abs(fitted), coherence, data.averages)
-        # The size of each channel's errors is what its residuals show.
+        # The residuals scale the errors of each channel.
         rms = _rms(residuals / std, fit, good)
         scale = np.maximum(rms, 1e-12 * rms.max()) if rms.max() > 0 else np.ones(len(rms))
     misfit = _rms(residuals / std, fit, good)
-    # Covariances for the mean size that the last residuals have, close to one.
+    # Covariances for the mean square of the last residuals, close to one.
     last = _rms(residuals / (std * scale[:, None]), fit, good)
     return fit.with_variance(float(np.mean(last**2))), FitSpread(std * scale[:, None], misfit)
 
 
 def _rms(residuals: np.ndarray, fit: SeparableFit, good: np.ndarray) -> np.ndarray:
-    """Root mean square of real and imaginary parts by the degrees of freedom of each channel."""
+    """Root mean square of real and imaginary parts, per degree of freedom of each channel."""
     shared = len(fit.unknowns) / len(residuals)
     free = np.maximum(2 * good.sum(axis=1) - fit.coefficients.shape[1] - shared, 1.0)
     return np.sqrt(np.nansum(np.abs(residuals) ** 2, axis=1) / free)
@@ -242,22 +244,22 @@ def modal_result(
     spread: FitSpread,
     orders: PoleOrders,
 ) -> LinearModalFit:
-    """A fit as modes in the order of their frequencies, with what a reader must know of it."""
+    """A fit as modes in the order of their frequencies, with notes."""
     natural, ratio, angle = unpacked(fit.unknowns, settings)
     rank = np.argsort(natural)
     n, sensors = len(natural), len(data.channels)
     covariance = np.zeros((n, 2 + sensors, 2 + sensors))
-    for place, k in enumerate(rank):
+    for position, k in enumerate(rank):
         pair = [k, n + k]
-        covariance[place, :2, :2] = fit.covariance[np.ix_(pair, pair)]
+        covariance[position, :2, :2] = fit.covariance[np.ix_(pair, pair)]
         cross = fit.cross_covariance(k)[pair]
-        covariance[place, :2, 2:], covariance[place, 2:, :2] = cross, cross.T
-        covariance[place, 2:, 2:] = fit.term_covariance(k)
+        covariance[position, :2, 2:], covariance[position, 2:, :2] = cross, cross.T
+        covariance[position, 2:, 2:] = fit.term_covariance(k)
     terms = [k for k, used in enumerate((settings.lower, settings.upper)) if used]
     residual, residual_std = np.zeros((2, sensors)), np.zeros((2, sensors))
-    for place, k in enumerate(terms):
-        residual[k] = fit.coefficients[:, n + place]
-        residual_std[k] = np.sqrt(np.diag(fit.term_covariance(n + place)))
+    for position, k in enumerate(terms):
+        residual[k] = fit.coefficients[:, n + position]
+        residual_std[k] = np.sqrt(np.diag(fit.term_covariance(n + position)))
     powers, groups = data.bases(windowed=settings.window_time is not None)
     bases = receptance_bases(data.omega, fit.unknowns, settings, powers)
     lines = len(data.omega)

@@ -13,11 +13,11 @@ from snrmjax.identify.curves.family_base import AbstractCurve, Argument
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity
 
-_SAMPLES = 200  # as many as files have: one compiled function serves both
+_SAMPLES = 200  # as many as in the files written: one compiled function serves both
 
 
 class BackboneValues(AbstractResult):
-    """A backbone at some amplitudes, with 1σ."""
+    """A backbone at given amplitudes, with 1σ."""
 
     coordinates: ClassVar[tuple[str, ...]] = ("velocity_m_s",)
 
@@ -38,9 +38,9 @@ class Backbone(AbstractResult):
     """ω̃ and ζ̃ of one mode as functions of the amplitude of its motion at one sensor.
 
     `squared_frequency` is ω̃² (rad²/s²) and `modal_damping` 2ζ̃ω̃ (1/s), against the
-    displacement (m) or the velocity (m/s) amplitude, as `argument` says; `covariance` belongs to
-    the parameters of the first, then of the second. Its curves are differentiable by the amplitude
-    and the parameters.
+    displacement (m) or the velocity (m/s) amplitude, depending on `argument`; `covariance` is
+    that of the parameters of the first, then of the second. The curves are differentiable with
+    respect to amplitude and parameters.
     """
 
     squared_frequency: AbstractCurve
@@ -62,7 +62,7 @@ class Backbone(AbstractResult):
         return {"sensor": self.sensor, "amplitude": self.argument}
 
     def moved_by(self, ratio: float) -> "Backbone":
-        """The same mode where a newton moves it so many times as much: the force acts elsewhere."""
+        """The same mode with its modal constant scaled, as for a force at another position."""
         return dataclasses.replace(self, modal_constant=self.modal_constant * ratio)
 
     def sampled(self, n_points: int = _SAMPLES, *, reach: float = 1.0) -> BackboneValues:
@@ -89,10 +89,10 @@ class Backbone(AbstractResult):
         return jnp.asarray(amplitude) * self.natural_frequency(amplitude)
 
     def values(self, amplitude: Float[Array | np.ndarray, " point"]) -> BackboneValues:
-        """All that the backbone says at some amplitudes, with standard deviations (1σ).
+        """Both curves at given amplitudes, with standard deviations (1σ).
 
-        Evaluated on the host, where nothing compiles; what is to be differentiated are
-        `natural_frequency` and `damping_ratio`.
+        Evaluated on the host, without compilation; for derivatives use `natural_frequency` and
+        `damping_ratio`.
         """
         at = np.asarray(amplitude, dtype=float)
         curves = self.squared_frequency, self.modal_damping
@@ -112,7 +112,7 @@ def banded_values(
     modal: Float[np.ndarray, " point"],
     covariance: Float[np.ndarray, "point 2 2"],
 ) -> BackboneValues:
-    """Both curves at velocities by ω̃², 2ζ̃ω̃ and the covariance of these two at every point.
+    """Both curves at velocities, from ω̃², 2ζ̃ω̃ and their covariance at every point.
 
     ζ̃ = δ/(2√s): dζ̃ = dδ/(2ω̃) − ζ̃ ds/(2s).
     """

@@ -1,4 +1,4 @@
-"""From measured steady states to points of the backbone and of the damping, with errors."""
+"""Points of the backbone and of the damping from measured steady states, with errors."""
 
 import dataclasses
 from typing import Any, ClassVar, Literal
@@ -31,8 +31,8 @@ class BackbonePoints(AbstractResult):
     """One natural frequency and damping ratio from every steady state.
 
     Amplitudes are those of the nonlinear mode at one sensor, `sensor`. Standard deviations (1σ)
-    are NaN where no noise is stated. `alternative_…` is what amplitude and phase alone would also
-    allow; NaN where there is no other root.
+    are NaN where no noise is stated. `alternative_…` is the second root that
+    amplitude and phase alone would allow; NaN where there is none.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("state", "level")
@@ -57,7 +57,7 @@ class BackbonePoints(AbstractResult):
     alternative_damping_ratio: Float[Array, " state"]
     sensitivity: Float[Array, "state output input"]  # of ω̃², 2ζ̃ω̃, log amplitude
     relative_std: Float[Array, "state input"]  # 1σ of log force, log velocity and phase
-    filter_residual: Float[Array, " state"]  # part of the mode's motion that its shape misses
+    filter_residual: Float[Array, " state"]  # relative residual of the projection on the mode shape
     status: Int[Array, " state"] = quantity("state", "", "outcome", of=PointStatus)
     sensor: str = setting()
     argument: Argument = eqx.field(static=True)
@@ -74,7 +74,7 @@ class BackbonePoints(AbstractResult):
         }
 
     def attributes(self) -> dict[str, str | float | int]:
-        """The sensor, and the amplitude at which frequencies and dampings belong."""
+        """The sensor, and the kind of amplitude that frequency and damping depend on."""
         return {**super().attributes(), "amplitude": self.argument}
 
     @property
@@ -84,7 +84,7 @@ class BackbonePoints(AbstractResult):
 
     @property
     def usable(self) -> Array:
-        """Points that enter curves: solved, and solved without doubt."""
+        """Points used for curves: solved and unambiguous."""
         return as_numpy(self.status) == int(PointStatus.OK)
 
 
@@ -107,16 +107,16 @@ def identify_points(
     several sensors the remainder is projected on the mode shape by weighted least squares; the
     two equations are solved for ω̃ and ζ̃.
 
-    Arguments: `amplitude` says at which amplitude ω̃ and ζ̃ belong: "displacement" is right for
-    a nonlinear stiffness and places the point on the backbone at the velocity vω̃/Ω; "velocity"
-    is the paper's choice. `measure` is the amplitude put into Eq. (12): of the fundamental, or
-    the peak of the time signal with all measured harmonics.
-    Returns `BackbonePoints`; every state has a status and NaN where there is no answer.
+    Arguments: `amplitude` is the argument of ω̃ and ζ̃: "displacement" suits a nonlinear stiffness
+    and puts the point on the backbone at the velocity vω̃/Ω; "velocity" is the paper's choice.
+    `measure` is the amplitude used in Eq. (12): that of the fundamental, or the peak of the time
+    signal with all measured harmonics.
+    Returns `BackbonePoints`; every state has a status, and NaN where there is no solution.
     Raises `ValueError` when the peak is asked for without harmonics, when the force or a phase is
     unknown, or when the sensors are not those of the modes.
-    Differentiable by velocities, forces, frequencies, stated errors and the modes, in forward and
-    reverse mode; a state without an answer has derivatives zero or NaN and leaves the others' as
-    they are. The other root of a state counts as far as there is one.
+    Differentiable with respect to velocities, forces, frequencies, stated errors and the modes, in
+    forward and reverse mode; a state without a solution has derivatives zero or NaN and does not
+    affect the others. So is the second root where there is one.
     Reference: Kwarta & Allen, section 2.2; the displacement argument is this package's own.
     """
     if data.sensors != modes.sensors:
@@ -142,8 +142,8 @@ def identify_points(
 def _identify(
     data: SteadyStates, modes: LinearModes, r: int, amplitude: Argument, measure: AmplitudeMeasure
 ) -> BackbonePoints:
-    # States without a force or a frequency are solved for harmless ones and masked afterwards:
-    # in a derivative `where` does not stop a NaN that was computed.
+    # States without a force or a frequency are solved with placeholder values and masked
+    # afterwards: in a derivative `where` does not stop a NaN.
     forced = jnp.isfinite(data.force) & (data.force > 0)
     timed = jnp.isfinite(data.frequency) & (data.frequency > 0)
     sound = forced & timed
@@ -228,8 +228,8 @@ def moved_by_modal_mass(
 ) -> tuple[Any, Any]:
     """Derivatives of ω̃ and ζ̃ with respect to the logarithm of the model's modal mass.
 
-    ω̃² − Ω² and 2ζ̃ω̃ are in proportion to the force over the modal mass: at resonance an error of
-    it is one of the damping alone, of the same relative size.
+    ω̃² − Ω² and 2ζ̃ω̃ are proportional to the force over the modal mass: at resonance a relative
+    error of it appears in the damping alone, equally large.
     """
     by_squares = -(natural**2 - frequency**2) / (2 * natural)
     return by_squares, -damping * (1 + by_squares / natural)
@@ -242,7 +242,7 @@ def _ratios_std(
     relative_std: Float[Array, "state input"],
     linear_variance: Float[Array, "state output"],
 ) -> tuple[Array, Array]:
-    """1σ of ω̃ and ζ̃ from what the errors of the inputs and of the linear modes make of them."""
+    """1σ of ω̃ and ζ̃, propagated from the errors of the inputs and of the linear modes."""
     known = jnp.isfinite(natural) & jnp.all(jnp.isfinite(relative_std), axis=1)
 
     def safe(value: Array, stand_in: float) -> Array:
@@ -280,13 +280,13 @@ def modal_filter(
     velocity: Complex[Array, "state sensor"],
     relative_std: Float[Array, "state sensor input"],
 ) -> tuple[Array, Array, Array, Array]:
-    """The combination of the sensors' velocities that sees the mode of interest best.
+    """The combination of the sensors' velocities that best observes the mode of interest.
 
     Least squares of Φ_s η = V_s − V_res,s over the sensors, weighted with their stated errors
-    when all have them, is Φ_r η = Σ_s share_s (V_s − V_res,s). Where damping couples modes, Φ_s is
-    what a sensor then sees of the mode; of a force with phases the sum is relative to that of the
-    mode's own force (`SensedMode`). Returns Σ share_s V_s, the shares, the relative errors of the
-    sum and the relative residual of the least squares.
+    when all have them, is Φ_r η = Σ_s w_s (V_s − V_res,s). Where damping couples modes, Φ_s is the
+    mode's effective shape; for a force with phases the sum is relative to the phase of the mode's
+    own force (`SensedMode`). Returns Σ w_s V_s, the weights w_s, the relative errors of the sum and
+    the relative residual of the least squares.
     """
     sensed, shape = sensed_mode(modes, data.frequency), modes.mode_shape[:, modes.mode_of_interest]
     own = shape[r]
@@ -299,7 +299,7 @@ def modal_filter(
     errors = relative_std[..., 1:]
     stated = jnp.isfinite(errors)
     absolute = jnp.where(stated, errors, 0.0) * jnp.abs(velocity)[..., None]
-    # 1σ of the amplitude of every velocity that was measured, where all of them state it.
+    # 1σ of every measured amplitude, used as weights where all are stated.
     along = jnp.where(measured, absolute[..., 0], 1.0)
     known = jnp.all(stated[..., 0] & (along > 0) | ~measured, axis=1, keepdims=True)
     weight = jnp.where(measured, 1 / jnp.where(known, along, 1.0) ** 2, 0.0)
@@ -309,21 +309,21 @@ def modal_filter(
     modal = jnp.sum(fraction * of_mode, axis=1, keepdims=True) / own
     misfit = jnp.where(measured, of_mode - shape * modal, 0.0)
 
-    def size_of(parts: Complex[Array, "state sensor"]) -> Float[Array, " state"]:
+    def weighted_norm(parts: Complex[Array, "state sensor"]) -> Float[Array, " state"]:
         return _root(jnp.sum(weight * (parts.real**2 + parts.imag**2), axis=1))
 
-    relative_misfit = _ratio(size_of(misfit), size_of(of_mode))
+    relative_misfit = _ratio(weighted_norm(misfit), weighted_norm(of_mode))
     if not is_single(modes):
-        fraction = fraction * sensed.turn[:, None]
+        fraction = fraction * sensed.phase_factor[:, None]
     combined = jnp.sum(fraction * velocity, axis=1)
-    length = jnp.abs(combined)
+    magnitude = jnp.abs(combined)
 
-    # Errors of the sensors are independent; amplitude and phase errors lie along and across V.
+    # Sensor errors are independent; amplitude errors lie along V, phase errors across it.
     def error(component: int) -> Array:
         each = jnp.where(measured, fraction * absolute[..., component], 0.0)
         known_all = jnp.all(stated[..., component] | ~measured, axis=1)
         square = jnp.sum(each.real**2 + each.imag**2, axis=1)
-        return jnp.where(known_all, _ratio(_root(square), length), jnp.nan)
+        return jnp.where(known_all, _ratio(_root(square), magnitude), jnp.nan)
 
     std = jnp.stack([relative_std[:, 0, 0], error(0), error(1)], axis=1)
     return jnp.where(seen[:, 0], combined, jnp.nan), fraction, std, relative_misfit
@@ -331,8 +331,8 @@ def modal_filter(
 
 def _ratio(part: Float[Array, " state"], whole: Float[Array, " state"]) -> Float[Array, " state"]:
     """part/whole, NaN where the whole is zero."""
-    there = whole > 0
-    return jnp.where(there, part / jnp.where(there, whole, 1.0), jnp.nan)
+    nonzero = whole > 0
+    return jnp.where(nonzero, part / jnp.where(nonzero, whole, 1.0), jnp.nan)
 
 
 def _solve(
@@ -345,7 +345,7 @@ def _solve(
     sound: Bool[Array, " state"],
     sensed: SensedMode,
 ) -> tuple[SnrmPoints, Array, Array, Array, Array]:
-    """Points, mode's velocity, amplitude, derivatives, the linear modes' share of the variance."""
+    """Points, modal velocity, amplitude, derivatives, variance due to the linear modes."""
     j = modes.mode_of_interest
     keep = np.asarray(modes.residual_modes, dtype=int)
     half = keep.size
@@ -383,14 +383,14 @@ def _solve(
         solved: Array,
     ) -> Array:
         constant, velocity, residual = measured(inputs, parameters, frequency, fraction, ratio)
-        # What is not finite would pass to the whole batch: unsolved states get a harmless one.
+        # Non-finite values would spread over the whole batch: unsolved states get placeholders.
         constant, frequency, velocity, residual = (
             jnp.where(solved, value, stand_in)
             for value, stand_in in zip(
                 (constant, frequency, velocity, residual), (1.0, 1.0, 1.0, 0.0), strict=True
             )
         )
-        # The roots that `invert_phasor` finds are those of the closed form, and so their slopes.
+        # `invert_phasor` has the roots of the closed form, hence also its derivatives.
         own = velocity - residual
         natural, damping = closed_form(constant, frequency, own)
         argument = argument_of(own, frequency)
@@ -417,13 +417,13 @@ def off_resonance_error_factor(
 ) -> Float[np.ndarray, " state"]:
     """Error of each point relative to that of a point at resonance, where no noise is stated.
 
-    √(1 + (4 sin φ)²), φ the phase of the mode's velocity: at resonance a point needs no correction
-    for the distance from resonance, and away from it the correction brings its own errors.
+    √(1 + (4 sin φ)²), φ the phase of the mode's velocity: off resonance a point is extrapolated to
+    the backbone, which adds errors.
     """
     return np.sqrt(1.0 + (NOISE_GROWTH * np.sin(np.angle(mode_velocity))) ** 2)
 
 
 def _root(square: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Square root whose slope at zero is zero: 0 · ∞ would make derivatives of others NaN."""
-    there = square != 0
-    return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
+    """Square root with derivative zero at zero: 0 · ∞ would make other derivatives NaN."""
+    nonzero = square != 0
+    return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1.0)), 0.0)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
 
-_CHUNK = 1 << 14  # members that are solved at a time on a CPU: they stay in its cache
+_CHUNK = 1 << 14  # members solved at a time on a CPU: they fit into its cache
 
 
 def closed_form(
@@ -28,8 +28,8 @@ def closed_form(
 
     Arguments: `modal_constant` A = Φ_r Φᵀb F in m/s², `frequency` Ω in rad/s, `mode_velocity` in
     m/s relative to the force. Returns rad/s and a ratio; NaN where ω̃² is not positive.
-    Differentiable; a member without an answer leaves the derivatives of the others as they are.
-    It is the start and the test of the Newton solve. Reference: Kwarta & Allen, Eq. (18).
+    Differentiable; a member without a solution does not affect the derivatives of the others.
+    It starts and checks the Newton solve. Reference: Kwarta & Allen, Eq. (18).
 
     >>> omega, zeta = closed_form(jnp.array(6.0), jnp.array(500.0), jnp.array(0.6 + 0.0j))
     >>> float(omega), float(zeta)
@@ -49,14 +49,14 @@ def invert_phasor(
 
     Solves Eqs. (12) and (17) for every member by Newton's method (optimistix, vmapped), started
     from the closed form, in (ω̃² − Ω²)/Ω² and 2ζ̃ω̃/Ω. The phase of the nonlinear mode is that of
-    V − V_lin − V_RB; the amplitude of this difference tells which of two roots is meant, and
-    the other one, which the amplitude |V| and the phase alone would allow too, is reported in
+    V − V_lin − V_RB; the amplitude of this difference selects one of two roots, and
+    the other one, which amplitude |V| and phase alone would also allow, is reported in
     `alternative_…`.
 
     Arguments: `modal_constant` A = Φ_r Φᵀb F in m/s²; `frequency` Ω in rad/s; `velocity` V and
     `residual_velocity` V_lin + V_RB in m/s, phasors relative to the force.
     Returns `SnrmPoints`. Differentiable in forward and reverse mode (by the implicit function
-    theorem); a member without an answer leaves the derivatives of the others as they are.
+    theorem); a member without a solution does not affect the derivatives of the others.
     Reference: Kwarta & Allen, Eqs. (12), (17), (18).
     """
     given = (modal_constant, frequency, velocity, residual_velocity)
@@ -94,15 +94,15 @@ def invert_amplitude_phase(
     >>> p.natural_frequency, p.damping_ratio
     (Array([500.], dtype=float64), Array([0.01], dtype=float64))
     """
-    size, phase = jnp.asarray(amplitude), jnp.asarray(mode_phase)
+    magnitude, phase = jnp.asarray(amplitude), jnp.asarray(mode_phase)
     constant, omega, residual = map(jnp.asarray, (modal_constant, frequency, residual_velocity))
-    unknown = jnp.full(size.shape, jnp.nan)
+    unknown = jnp.full(magnitude.shape, jnp.nan)
     direction = jnp.cos(phase), jnp.sin(phase)
-    return _invert(_Member(constant, omega, size, *direction, residual, unknown))
+    return _invert(_Member(constant, omega, magnitude, *direction, residual, unknown))
 
 
 class _Member(NamedTuple):
-    """What is known of one steady state, or of a batch of them."""
+    """Known quantities of one steady state, or of a batch."""
 
     constant: Array  # m/s²
     frequency: Array
@@ -113,18 +113,18 @@ class _Member(NamedTuple):
     length: Array  # of the mode's own velocity; NaN where it is not measured
 
 
-# Stands in for members that cannot be solved, whose answers are masked afterwards.
-_HARMLESS = (1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0)
+# Placeholder for members that cannot be solved; their results are masked afterwards.
+_PLACEHOLDER = (1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0)
 
 
-def _kept(members: _Member, wanted: Array) -> _Member:
-    """The members that are wanted, and harmless ones in place of the others."""
-    pairs = zip(members, _HARMLESS, strict=True)
-    return _Member(*(jnp.where(wanted, value, safe) for value, safe in pairs))
+def _masked(members: _Member, selected: Array) -> _Member:
+    """The selected members, and placeholders for the others."""
+    pairs = zip(members, _PLACEHOLDER, strict=True)
+    return _Member(*(jnp.where(selected, value, safe) for value, safe in pairs))
 
 
 def _direction(phasor: Complex[Array, "*batch"]) -> tuple[Array, Array]:
-    """Cosine and sine of the phase, without the loss of an arctangent; NaN where there is none."""
+    """Cosine and sine of the phase, without the rounding of an arctangent; NaN where undefined."""
     phasor = jnp.asarray(phasor)
     known = _is_known(phasor)
     safe = jnp.where(known, phasor, 1.0)
@@ -175,15 +175,15 @@ def _equations(unknowns: Array, args: tuple) -> Array:
 
 def _newton(member: _Member) -> tuple[Array, Array, Array]:
     """One member: the Newton solve from the closed form at |V_nl| = `length`."""
-    # Who finds the program on disk does not wait for the import of its solver, which must not see
-    # that a program is being traced.
+    # Imported here so that a program cached on disk runs without importing its solver; the import
+    # itself must not be traced.
     with jax.ensure_compile_time_eval():
         from snrmjax.identify.pointwise.two_equations import root_of_two
 
     modal_constant, frequency, amplitude, cosine, sine, residual, length = member
-    # The unknown is D = scale·((x² − 1) + 2iζ̃x), x = ω̃/Ω, of length one at the closed form: x
-    # itself would resolve a lightly damped resonance no finer than rounding of Ω allows.
-    # Units belong to the scaling, not to the equations: no derivative goes through them.
+    # The unknown is D = scale·((x² − 1) + 2iζ̃x), x = ω̃/Ω, with |D| = 1 at the closed form: x
+    # itself would lose a lightly damped resonance to rounding of Ω.
+    # Scale factors only: no derivative goes through them.
     fixed = jax.lax.stop_gradient
     start = fixed(jnp.sign(modal_constant) * jnp.stack([sine, cosine]))
     unit = fixed(1.0 / (length + jnp.abs(residual)))
@@ -199,7 +199,7 @@ def _newton(member: _Member) -> tuple[Array, Array, Array]:
     value, good = root_of_two(_equations, start, args)
     squared = 1.0 + value[0] / scale
     real = squared > 0
-    # NaN only at the end: inside it would pass every `where` on a derivative's way back.
+    # NaN only at the end: inside it would pass every `where` in reverse mode.
     x = jnp.sqrt(jnp.where(real, squared, 1.0))
     natural = jnp.where(real, x * frequency, jnp.nan)
     damping = jnp.where(real, value[1] / (2.0 * scale * x), jnp.nan)
@@ -213,7 +213,7 @@ def _invert(members: _Member) -> SnrmPoints:
     n = flat.constant.shape[0]
     if n <= _CHUNK or jax.default_backend() != "cpu":
         return jax.tree.map(lambda a: a.reshape(shape), _invert_flat(flat))
-    # A member that needs more steps then delays its own chunk only.
+    # In chunks: a member that needs more steps delays only its own chunk.
     padded = jax.tree.map(lambda a: jnp.pad(a, (0, -n % _CHUNK)).reshape(-1, _CHUNK), flat)
     answers = jax.lax.map(_invert_flat, padded)
     return jax.tree.map(lambda a: a.reshape(-1)[:n].reshape(shape), answers)
@@ -230,9 +230,9 @@ def _invert_flat(members: _Member) -> SnrmPoints:
         & (members.amplitude > 0)
         & (members.frequency > 0)
     )
-    # What is not finite is kept out of every step: in a derivative `where` does not stop a NaN.
+    # Non-finite values are kept out of every step: in a derivative `where` does not stop a NaN.
     members = members._replace(length=jnp.where(known, members.length, 1.0))
-    members = _kept(members, finite)
+    members = _masked(members, finite)
     known_length, amplitude, residual = members.length, members.amplitude, members.residual
     # r² + 2br + d = 0 with b = Re(e^{−iφ} W), d = |W|² − v²; the root far from zero first.
     half = members.cosine * residual.real + members.sine * residual.imag
@@ -252,12 +252,12 @@ def _invert_flat(members: _Member) -> SnrmPoints:
     forced = members.constant != 0
     solvable = finite & forced & has_root
 
-    def solve(r: Array, wanted: Array) -> tuple[Array, Array, Array, Array]:
-        own = _kept(members._replace(length=r), wanted)
+    def solve(r: Array, selected: Array) -> tuple[Array, Array, Array, Array]:
+        own = _masked(members._replace(length=r), selected)
         squared = own.frequency**2 + own.frequency * own.constant / own.length * own.sine
         real = squared > 0
         natural, damping, good = jax.vmap(_newton)(own)
-        answer = wanted & real & good
+        answer = selected & real & good
         nan = jnp.nan
         return jnp.where(answer, natural, nan), jnp.where(answer, damping, nan), real, good
 

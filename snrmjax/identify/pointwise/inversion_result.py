@@ -1,4 +1,4 @@
-"""What an inversion answers: a natural frequency and a damping ratio, or the reason for none."""
+"""Result of an inversion: natural frequency and damping ratio, or the reason for none."""
 
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ from snrmjax.numerics.status import Status
 
 
 class PointStatus(Status):
-    """What became of one inversion."""
+    """Outcome of one inversion."""
 
     OK = 0, "ok"
     TWO_ROOTS = 1, "two roots: the residual response exceeds the measured one"
@@ -38,7 +38,7 @@ _USUAL_CAUSE: dict[PointStatus, str] = {
 
 
 def reasons_in_words(status: Int[np.ndarray | Array, " state"]) -> str:
-    """Why states have no point, the most frequent reason first, and what most often causes it."""
+    """Why states have no point, the most frequent reason first with its usual cause."""
     kinds, counts = np.unique(np.asarray(status), return_counts=True)
     order = [k for k in np.argsort(-counts, kind="stable") if kinds[k] != PointStatus.OK]
     reasons = [(PointStatus(int(kinds[k])), int(counts[k])) for k in order]
@@ -48,10 +48,10 @@ def reasons_in_words(status: Int[np.ndarray | Array, " state"]) -> str:
 
 
 class SnrmPoints(AbstractResult):
-    """ω̃ and ζ̃ of a batch of steady states; NaN wherever the status says that there is none.
+    """ω̃ and ζ̃ of a batch of steady states; NaN where the inversion failed (see `status`).
 
-    `alternative_…` is what amplitude and phase alone would also allow, NaN where there is no other
-    root.
+    `alternative_…` is the second root that amplitude and phase alone would allow, NaN where there
+    is none.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("member",)

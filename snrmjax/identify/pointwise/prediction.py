@@ -1,4 +1,4 @@
-"""Forced responses that an identified backbone predicts: resonances and whole curves."""
+"""Forced responses predicted from an identified backbone: resonances and response curves."""
 
 import dataclasses
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class Resonance(AbstractResult):
     """A phase resonance under a given force: the nonlinear mode moves in phase with it."""
 
     force: float = quantity("", "N", "force amplitude")
-    amplitude: float  # of the backbone's argument, m or m/s
+    amplitude: float  # argument of the backbone, m or m/s
     frequency: float = quantity("", "Hz", "frequency")  # rad/s
     damping_ratio: float = quantity("", "1", "damping ratio")
     # At the backbone's sensor, residual modes included.
@@ -35,7 +35,7 @@ class Resonance(AbstractResult):
 class PredictedResponse(AbstractResult):
     """One connected response curve in order: up the low-frequency side, down the other.
 
-    `isolated` is a closed curve, apart from the main one.
+    `isolated` marks a closed curve (isola) detached from the main one.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("point",)
@@ -48,7 +48,7 @@ class PredictedResponse(AbstractResult):
     branch: tuple[str, ...]  # "lead" (velocity leads the force) or "lag" for every point
     continued: Bool[np.ndarray, " point"] = quantity("point", "1", "beyond the measured amplitudes")
     isolated: bool
-    # Where it extrapolates the backbone, and what was not located.
+    # On extrapolation of the backbone, and events that were not located.
     notes: tuple[Fact, ...]
 
     @property
@@ -72,11 +72,11 @@ class PredictedResponse(AbstractResult):
 
 
 LARGEST_AMPLITUDE_RATIO = 1.5
-"""Predictions end, unless asked for more, at this multiple of the largest measured amplitude."""
+"""Default end of predictions, as a multiple of the largest measured amplitude."""
 
 _SCAN = 4096  # amplitudes
-_ONTO_THE_SIDE = 4  # rounds of frequency and what depends on it
-_SMALLEST = 0.02  # of its largest amplitude: where the main curve starts
+_ITERATIONS = 4  # fixed-point iterations of frequency and effective participation
+_SMALLEST = 0.02  # of its largest amplitude, where the main curve starts
 
 
 @on_numbers("Differentiate the curves of the backbone themselves.")
@@ -93,12 +93,11 @@ def resonances(
     of amplitude; the total adds the residual modes. Damping that falls with amplitude can give
     several solutions.
 
-    Arguments: `force` in N; solutions are looked for up to `largest_amplitude_ratio` times the
+    Arguments: `force` in N; solutions are sought up to `largest_amplitude_ratio` times the
     largest measured amplitude. Beyond the measured amplitudes the backbone is extrapolated along
-    its end slopes, which no measurement supports: see `Resonance.continued`. Solutions there at
-    which damping falls faster than amplitude grows, on its way to nothing, are none of the
-    structure's and are left out.
-    Returns the solutions in order of amplitude; an empty list when none lies there.
+    its end slopes, without support by measurements: see `Resonance.continued`. Solutions there
+    caused by extrapolated damping that falls towards zero are artefacts and are left out.
+    Returns the solutions in order of amplitude; an empty list when there is none.
     Raises `ValueError` for a force or a ratio that is not positive.
     Not differentiable: differentiate `Backbone` itself, or `snrm_velocity`.
     Reference: Kwarta & Allen, Eq. (19).
@@ -114,7 +113,7 @@ def resonances(
     tips = []
     for k in np.flatnonzero(weak[:-1] != weak[1:]):
         if not weak[k] and amplitude[k] >= backbone.largest:
-            continue  # extrapolated damping on its way to nothing
+            continue  # extrapolated damping falls to zero
         root = np.mean(_change(backbone, too_weak, amplitude[k], amplitude[k + 1]))
         tips.append(_resonance(backbone, modes, force, float(root)))
     return tips
@@ -131,19 +130,19 @@ def predict_response(
     points_per_side: int = 200,
     largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
 ) -> list[PredictedResponse]:
-    """The whole response to a force, both sides of resonance and the unstable part included.
+    """The whole response to a force: both sides of resonance and the unstable part.
 
     With the amplitude as parameter the frequency has a closed form: for a displacement X
     Ω² = ω̃² − δ²/2 ± √((|A|F/X)² − δ²ω̃² + δ⁴/4), δ = 2ζ̃ω̃, and likewise for a velocity. A point
-    is unstable where, at fixed frequency, a larger amplitude needs less force, or where the
-    damping of small changes of amplitude is negative: both follow from the averaged equations.
+    is unstable where, at fixed frequency, a larger amplitude needs less force, or where small
+    changes of amplitude have negative damping: both follow from the averaged equations.
 
     Arguments: `force` in N, frequencies in rad/s; `points_per_side` on either side of every
     resonance; curves end at `largest_amplitude_ratio` times the largest measured amplitude. Beyond
-    the measured amplitudes the backbone is extrapolated along its end slopes, which no measurement
-    supports.
-    Returns the connected curves, the main one first, isolated ones after it; the `note` of each
-    says where it extrapolates.
+    the measured amplitudes the backbone is extrapolated along its end slopes, without support by
+    measurements.
+    Returns the connected curves, the main one first, then isolas; the `note` of each states where
+    it extrapolates.
     Raises `ValueError` for a force or a ratio that is not positive.
     Not differentiable: its points move with the curve's ends. Differentiate `Backbone` itself.
     Reference: Kwarta & Allen, section 2.2 and Eq. (10).
@@ -170,7 +169,7 @@ def predict_response(
     for number, (low, high) in enumerate(zip(starts, ends, strict=True)):
         main = number == 0 and bool(inside[0])
         if not main and low >= backbone.largest:
-            continue  # it starts where extrapolated damping goes to nothing
+            continue  # it starts where extrapolated damping falls to zero
         curve = _one_curve(
             backbone,
             modes,
@@ -181,7 +180,7 @@ def predict_response(
             closed=not main,
         )
         keep = (curve.frequency >= from_frequency) & (curve.frequency <= to_frequency)
-        # A range that cuts the peak off leaves two pieces, which no line may join.
+        # A range that cuts off the peak leaves two separate pieces.
         runs = np.split(np.arange(len(keep)), np.flatnonzero(np.diff(keep.astype(int))) + 1)
         curves += [_part(curve, run, backbone) for run in runs if run.size and keep[run[0]]]
     return curves
@@ -195,7 +194,7 @@ def _require_force(force: float) -> None:
 def _scan(backbone: Backbone, ratio: float) -> Float[np.ndarray, " point"]:
     """Amplitudes from zero to `ratio` times the largest measured one.
 
-    Not beyond where extrapolated damping ends: a passive structure has none below zero.
+    Not beyond zero extrapolated damping: a passive structure has no negative damping.
     """
     if not ratio > 0 or not np.isfinite(ratio):
         raise ValueError(f"`largest_amplitude_ratio` must be positive, but is {ratio!r}.")
@@ -206,7 +205,7 @@ def _scan(backbone: Backbone, ratio: float) -> Float[np.ndarray, " point"]:
 
 
 class _OnBackbone(NamedTuple):
-    """ω̃², 2ζ̃ω̃ and their slopes at some amplitudes; what follows from them is plain NumPy."""
+    """ω̃², 2ζ̃ω̃ and their slopes at given amplitudes, with derived quantities in NumPy."""
 
     amplitude: Float[np.ndarray, " point"]
     squared: Float[np.ndarray, " point"]
@@ -238,7 +237,7 @@ class _OnBackbone(NamedTuple):
         else:
             middle = self.squared + 0.5 * (ratio - self.damping**2)
             margin = middle**2 - self.squared**2
-            # Without real frequencies the product of the roots, ω̃⁴, still lets both be negative.
+            # The product of the roots is ω̃⁴ > 0, so both may be negative: no real frequency.
             margin = np.where(middle > 0, margin, -np.abs(margin))
         root = np.sqrt(np.maximum(margin, 0.0))
         with np.errstate(invalid="ignore"):
@@ -247,10 +246,10 @@ class _OnBackbone(NamedTuple):
     def stable(self, frequency: Float[np.ndarray, " point"]) -> Bool[np.ndarray, " point"]:
         """Stability of the averaged equations at (amplitude, Ω), see `predict_response`."""
         stiffness = self.squared - frequency**2
-        turn = frequency**2 * self.damping * self.damping_slope
+        loss = frequency**2 * self.damping * self.damping_slope
         # d(A²F²)/da at fixed Ω, without a positive factor.
         rise = stiffness**2 + (self.damping * frequency) ** 2
-        rise += self.amplitude * (stiffness * self.squared_slope + turn)
+        rise += self.amplitude * (stiffness * self.squared_slope + loss)
         return (rise > 0) & (2 * self.damping + self.amplitude * self.damping_slope > 0)
 
 
@@ -263,13 +262,13 @@ def _on_backbone(backbone: Backbone, amplitude: Float[np.ndarray, " point"]) -> 
 def _values_and_slopes(
     backbone: Backbone, amplitude: Float[np.ndarray, " point"]
 ) -> tuple[Array, Array, Array, Array]:
-    """A compiled program: scans of thousands of amplitudes take the host ten times as long."""
+    """Compiled: a scan of thousands of amplitudes is ten times as fast as on the host."""
     at = jnp.asarray(amplitude)
 
     def curves(a: Array) -> tuple[Array, Array]:
         return backbone.squared_frequency(a), backbone.modal_damping(a)
 
-    # Both curves hold point by point: one push forward along ones gives every slope.
+    # The curves act pointwise: one JVP along ones gives every slope.
     values, slopes = jax.jvp(curves, (at,), (jnp.ones_like(at),))
     return *values, *slopes
 
@@ -277,11 +276,11 @@ def _values_and_slopes(
 def _change(
     backbone: Backbone, holds: Callable[[_OnBackbone], np.ndarray], low: float, high: float
 ) -> tuple[float, float]:
-    """Neighbouring amplitudes of which a condition holds at one only, to rounding."""
+    """Bracket of the amplitude at which a condition changes, refined to rounding."""
     for _ in range(5):
         fine = low + (high - low) * np.linspace(0.0, 1.0, _SCAN + 1)
-        held = holds(_on_backbone(backbone, fine))
-        k = max(int(np.argmin(held == held[0])), 1)
+        true = holds(_on_backbone(backbone, fine))
+        k = max(int(np.argmin(true == true[0])), 1)
         low, high = fine[k - 1], fine[k]
     return low, high
 
@@ -323,7 +322,7 @@ def _velocity(
 def _participation(
     modes: LinearModes, frequency: Float[np.ndarray, " point"]
 ) -> Float[np.ndarray, " point"]:
-    """`SensedMode.ratio` at frequencies in rad/s; where there is none, that of the linear mode."""
+    """`SensedMode.ratio` at frequencies in rad/s; that of the linear mode where undefined."""
     known = np.isfinite(frequency) & (frequency > 0)
     linear = modes.natural_frequency.item(modes.mode_of_interest)
     rows = padded(np.where(known, frequency, linear))
@@ -341,20 +340,20 @@ def _one_curve(
     closed: bool,
 ) -> PredictedResponse:
     load = abs(float(backbone.modal_constant)) * force
-    # Points crowd where both sides meet: there the frequency changes with a square root.
+    # Points are denser where both sides meet: the frequency has a square-root behaviour there.
     angle = np.linspace(0.0, 1.0, points_per_side)
     fraction = 0.5 * (1 - np.cos(np.pi * angle)) if closed else np.sin(0.5 * np.pi * angle)
     amplitude = low + (high - low) * fraction
     both = _on_backbone(backbone, np.concatenate([amplitude, amplitude[::-1]]))
     side, ratio = np.arange(2 * points_per_side) < points_per_side, both.participation(modes)
-    # How strongly the force moves a mode that damping couples to others depends on the frequency.
-    for _ in range(1 if is_single(modes) else _ONTO_THE_SIDE):
+    # With damping coupling the effective participation depends on the frequency.
+    for _ in range(1 if is_single(modes) else _ITERATIONS):
         below, above, _ = both.frequencies(load * ratio)
         squared = np.where(side, below, above)
         if not is_single(modes):
             ratio = _participation(modes, np.sqrt(np.maximum(squared, 0.0)))
-    # Points without a real frequency are dropped at the end: every force has the same shapes,
-    # and the functions below are compiled once.
+    # Points without a real frequency are dropped at the end: array shapes do not depend on the
+    # force, and the functions below are compiled once.
     keep = squared > 0
     frequency = np.sqrt(np.where(keep, squared, 1.0))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -377,7 +376,7 @@ def _one_curve(
 
 
 def _part(curve: PredictedResponse, keep: np.ndarray, backbone: Backbone) -> PredictedResponse:
-    """Some points of a curve, and the note on those that extrapolate the backbone."""
+    """Selected points of a curve, with a note on those that extrapolate the backbone."""
     amplitude, continued = curve.amplitude[keep], curve.continued[keep]
     notes: tuple[Fact, ...] = ()
     if continued.any():

@@ -1,16 +1,16 @@
 """The single nonlinear resonant mode function: one mode with amplitude-dependent properties.
 
-Damping that couples modes, with the coupling C between them, leaves the equation of the mode j
-with all others o eliminated, at iΩ = s:
+With damping coupling C between the modes, eliminating all others o leaves for the mode j, at
+s = iΩ:
 
   (f(s) + N) q_j = (p_j − s C_jo D_oo⁻¹ p_o) F,   f = D_jj − s² C_jo D_oo⁻¹ C_oj,
   V_s = s (Φ_sj − s Φ_so D_oo⁻¹ C_oj) q_j + s Φ_so D_oo⁻¹ p_o F,
 
-where D is the modal dynamic stiffness, N what the nonlinear elements add to it, and p the
+where D is the modal dynamic stiffness, N the contribution of the nonlinear elements, and p the
 participations, complex for a force with phases. With f = κ(s)·(s² + 2ζ̃₀ω̃₀s + ω̃₀²), of which ω̃₀
 and ζ̃₀ are those of the eigenvalue of the linear structure, the left side divided by κ is that of
 one mode again. Its ω̃ and ζ̃ are those of the complex mode: exact for a linear structure at every
-frequency, and to the first order in the coupling for what nonlinear elements add.
+frequency, and to first order in the coupling for the nonlinear elements.
 """
 
 from typing import Any, NamedTuple
@@ -24,36 +24,38 @@ from snrmjax.model.modes import LinearModes, dynamic_stiffness, phasor_of_load, 
 from snrmjax.model.modes import reference_sensor as reference_sensor
 from snrmjax.numerics.compiled import compiled
 
-_STEPS = 20  # of Newton's method, from the mode without the others
-_AT_THE_POLE = 1e-6  # relative distance of Ω from a pole, within which κ is taken beside it
+_STEPS = 20  # of Newton's method, from the uncoupled mode
+_AT_THE_POLE = 1e-6  # relative distance of Ω from a pole within which κ is evaluated next to it
 
 
 class SensedMode(NamedTuple):
-    """How the mode of interest, with others that damping couples to it, is seen and driven.
+    """Effective shape and participation of the mode of interest under damping coupling.
 
-    All one for modal damping and a force without phases. A sensor sees the mode's own motion as
-    Φ q, times `seen`, and the force moves it as its participation, times `driven`, says.
+    Factors, all one for modal damping and a force without phases: the mode's velocity at a sensor
+    is Φ q times `seen`, its participation that of `participation_of` times `driven`.
     """
 
     seen: Complex[Array, "*batch sensor"] | float
     driven: Complex[Array, "*batch"] | float
 
     @property
-    def turn(self) -> Any:
-        """What a velocity is multiplied by, to be relative to the phase in which it is driven."""
+    def phase_factor(self) -> Any:
+        """Unit factor that makes a velocity relative to the phase of the effective force."""
         return jnp.conj(self.driven) / jnp.abs(self.driven)
 
     @property
     def ratio(self) -> Any:
-        """Of the participation's size to that of `participation_of`."""
+        """Magnitude of the effective participation over `participation_of`."""
         return jnp.abs(self.driven)
 
     def to_mode(self, sensor: int) -> Any:
-        """What a sensor's velocity is multiplied by to be the mode's own, in phase with its drive.
+        """Factor from a sensor's velocity, without residual modes, to the mode's own velocity.
 
-        Without that of the residual modes.
+        Relative to the phase of the effective force.
         """
-        return self.turn / (self.seen if isinstance(self.seen, float) else self.seen[..., sensor])
+        return self.phase_factor / (
+            self.seen if isinstance(self.seen, float) else self.seen[..., sensor]
+        )
 
 
 def is_single(modes: LinearModes) -> bool:
@@ -62,8 +64,8 @@ def is_single(modes: LinearModes) -> bool:
 
 
 def participation_of(modes: LinearModes) -> Float[Array, ""]:
-    """Φᵀb of the mode of interest in kg^-1/2; of a force with phases its size, and the sign of the
-    part in phase.
+    """Φᵀb of the mode of interest in kg^-1/2; for a force with phases its magnitude, with the sign
+    of the in-phase part.
     """
     own = modes.participation[modes.mode_of_interest]
     if modes.participation_lag is None:
@@ -86,12 +88,12 @@ def linear_mode(modes: LinearModes) -> tuple[Any, Any]:
 def sensed_mode(
     modes: LinearModes, frequency: Float[Array | np.ndarray, "*batch"] | float
 ) -> SensedMode:
-    """What the module's equations make of the mode of interest at frequencies in rad/s."""
+    """Effective shape and participation of the mode of interest at frequencies in rad/s."""
     return SensedMode(1.0, 1.0) if is_single(modes) else SensedMode(*_sensed(modes, frequency))
 
 
 class _Eliminated(NamedTuple):
-    """f(s), and what the others move and pass on, for one s."""
+    """f(s), effective shape and effective participation at one s."""
 
     stiffness: Complex[Array, ""]
     shape: Complex[Array, " sensor"]
@@ -132,13 +134,13 @@ def _sensed(modes: LinearModes, frequency: Array) -> tuple[Array, Array]:
     omega = jnp.asarray(frequency)
     natural, ratio = linear_mode(modes)
     near = jnp.abs(omega**2 - natural**2) + ratio * natural * omega < _AT_THE_POLE * omega**2
-    # κ is smooth: where both its parts vanish it is taken a little farther on.
+    # κ is smooth: where numerator and denominator vanish it is evaluated next to the pole.
     s = 1j * omega * jnp.where(near, 1 + 2 * _AT_THE_POLE, 1.0)
     one = jnp.vectorize(lambda s: tuple(_eliminated(modes, s)), signature="()->(),(s),()")
     stiffness, shape, participation = one(s)
     kappa = stiffness / (s**2 + 2 * ratio * natural * s + natural**2)
     own = modes.mode_shape[:, modes.mode_of_interest]
-    # A sensor at a node of the mode sees what the others move alone.
+    # At a node of the mode the factor is undefined: left at one.
     still = own == 0
     seen = jnp.where(still, 1.0, shape / jnp.where(still, 1.0, own))
     return seen, participation / (kappa * participation_of(modes))
@@ -152,9 +154,9 @@ def nonlinear_mode_velocity(
 ) -> Complex[Array, "*batch"]:
     """Velocity of the nonlinear mode, V = iΩA / (ω̃² − Ω² + 2iζ̃ω̃Ω).
 
-    Arguments: `modal_constant` A = Φ_r Φᵀb F of one sensor in m/s² (its sign turns the phase by
-    180°), frequencies in rad/s. Returns the phasor relative to the force, in m/s; differentiable.
-    Reference: Kwarta & Allen, V^nl in Eq. (10b), turned by +90° (the paper forces with a sine).
+    Arguments: `modal_constant` A = Φ_r Φᵀb F of one sensor in m/s² (negative: a phase
+    of 180°), frequencies in rad/s. Returns the phasor relative to the force in m/s; differentiable.
+    Reference: Kwarta & Allen, V^nl in Eq. (10b), rotated by +90° (the paper forces with a sine).
 
     >>> nonlinear_mode_velocity(*jnp.array([6.0, 500.0, 0.01, 500.0])).real.round(6)
     Array(0.6, dtype=float64)

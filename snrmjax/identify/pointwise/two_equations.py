@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool, Float
 
 
 class CramersRule(lx.AbstractLinearSolver[Any]):
-    """Solves a 2×2 linear system by Cramer's rule: the whole cost of a small Newton step.
+    """Solves a 2×2 linear system by Cramer's rule, for cheap Newton steps.
 
-    With `zero_stays_zero` a zero right side has a zero answer even of a singular matrix: on the
-    way back of a derivative a failed member of a batch then adds nothing to the others.
+    With `zero_stays_zero` a zero right side gives zero even for a singular matrix: in reverse mode
+    a failed member of a batch then does not affect the others.
     """
 
     zero_stays_zero: bool = False
@@ -57,7 +57,7 @@ _ADJOINT = optx.ImplicitAdjoint(linear_solver=CramersRule(zero_stays_zero=True))
 def root_of_two(
     equations: Callable[[Array, Any], Array], start: Float[Array, "2"], args: Any
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
-    """The root near a start, and whether it was reached; differentiable by `args`."""
+    """The root near a start, and whether it was reached; differentiable with respect to `args`."""
     solution: optx.Solution = optx.root_find(
         equations, _NEWTON, start, args, max_steps=_STEPS, adjoint=_ADJOINT, throw=False
     )

@@ -1,1 +1,1 @@
-"""What an identification predicts of a level that was not measured."""
+"""Predictions for a level that was not measured."""

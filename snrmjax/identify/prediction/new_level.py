@@ -1,4 +1,4 @@
-"""Errors of a level that was not measured: as levels differ, with their trend, on another day."""
+"""Errors of a level that was not measured: scatter and trend of levels, day-to-day variation."""
 
 from typing import NamedTuple
 
@@ -11,12 +11,12 @@ from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.compiled import on_numbers
 
-_FEWEST = 3  # levels, of which a straight line leaves something
-_CHANCE = 0.05  # of a trend where levels differ at random
+_FEWEST = 3  # levels for a linear regression
+_CHANCE = 0.05  # p-value below which a trend is significant
 
 
 class DayToDay(NamedTuple):
-    """By how much another day's test of the same structure differs, relative, 1σ."""
+    """Relative 1σ of day-to-day variation between tests of the same structure."""
 
     frequency: float = 0.0
     damping: float = 0.0
@@ -24,37 +24,37 @@ class DayToDay(NamedTuple):
 
 
 class LevelTrend(NamedTuple):
-    """One kind of levels' errors that changes steadily with their force: a law, not chance."""
+    """A significant linear trend of one kind of level errors with force."""
 
     kind: str  # of `LEVEL_ERRORS`
-    first: float  # the straight line at the smallest force; relative, or rad
+    first: float  # regression line at the smallest force; relative, or rad
     last: float  # at the largest
     there: float  # at the force of the prediction
     p_value: float
 
 
 class NewLevel(NamedTuple):
-    """What a level may err in beside the fitted curves, 1σ each, and how its force is known."""
+    """1σ of a new level's errors about the fitted curves, and how its force is given."""
 
     std: Float[np.ndarray, " error"]  # of `LEVEL_ERRORS`
-    drive: float | None = None  # the record (N or V) of the force; None: the force itself is given
+    drive: float | None = None  # recorded force (N or V); None: the true force is given
     trends: tuple[LevelTrend, ...] = ()
-    another_day: bool = False  # whether `std` holds another day's errors too
-    forced: LinearModes | None = None  # the modes as the force moves them; None: as in the test
+    another_day: bool = False  # whether `std` includes day-to-day variation
+    forced: LinearModes | None = None  # modes under the new force location; None: as in the test
 
     def modes(self, fit: JointFit) -> LinearModes:
-        """The linear modes, moved as the predicted force does."""
+        """The linear modes with the participation of the predicted force."""
         return fit.modes if self.forced is None else self.forced
 
     def over_test(self, fit: JointFit) -> float:
-        """How many times as much a newton moves the mode of interest as it did in the test."""
+        """Participation of the mode of interest over that in the test."""
         if self.forced is None:
             return 1.0
         return float(participation_of(self.forced) / participation_of(fit.modes))
 
 
 ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))
-"""No level at all: the force in newtons moves the fitted mode itself."""
+"""The fitted curves themselves, without level errors, under a force in newtons."""
 
 
 @on_numbers("Differentiate `sj.identify.refit`.")
@@ -66,14 +66,14 @@ def new_level(
     day: DayToDay | None = None,
     at: str | None = None,
 ) -> NewLevel:
-    """The errors of one further level under a force, as large as the fit's levels have them.
+    """Level errors of a new level under a force, with the fit's level-to-level 1σ.
 
-    An error that changes steadily with the levels' force counts as large as its straight line has
-    it there.
+    Where a level error has a significant trend with force, its regression value at this force is
+    added (in quadrature).
 
-    Arguments: `force` in N; `as_recorded` where not the force is given but what the test records of
-    it, whose gain then errs too; `day` what another day's test differs by; `at` the sensor or point
-    where the force acts, if not where it did in the test.
+    Arguments: `force` in N; with `as_recorded` the level is set by the recorded force, which then
+    has a gain error too; `day` the day-to-day variation; `at` the sensor or point where the force
+    acts, if not as in the test.
     Raises what `LinearModes.forced_at` raises.
     Not differentiable: differentiate `snrmjax.identify.refit`.
     """
@@ -83,8 +83,8 @@ def new_level(
     as_in_test = force * abs(new.over_test(fit))
     trends = _trends(fit, as_in_test) if fit.data.n_levels >= _FEWEST else ()
     for trend in trends:
-        place = LEVEL_ERRORS.index(trend.kind)
-        std[place] = np.hypot(std[place], trend.there)
+        kind = LEVEL_ERRORS.index(trend.kind)
+        std[kind] = np.hypot(std[kind], trend.there)
     if day is not None:
         std = np.hypot(std, [day.gain, 0.0, 2 * day.frequency, day.damping])
     record = float(fit.recorded_force(np.array(force))) if as_recorded else None
@@ -94,16 +94,16 @@ def new_level(
 def _trends(fit: JointFit, force: float) -> tuple[LevelTrend, ...]:
     trends, level = [], np.asarray(fit.data.level)
     known = fit.force_of_drive(np.asarray(fit.data.force))
-    size = np.array([np.median(known[level == k]) for k in range(fit.data.n_levels)])
-    if not np.ptp(size) > 0:
+    level_force = np.array([np.median(known[level == k]) for k in range(fit.data.n_levels)])
+    if not np.ptp(level_force) > 0:
         return ()
     from scipy.stats import linregress  # slow to import, and rarely needed
 
     deviation = np.asarray(fit.unknowns.level * fit.prior.level)
     for kind, errors in zip(LEVEL_ERRORS, deviation.T, strict=True):
-        line = linregress(size, errors) if np.any(errors != 0) else None
+        line = linregress(level_force, errors) if np.any(errors != 0) else None
         if line is not None and line.pvalue < _CHANCE:
-            places = (size.min(), size.max(), force)
-            first, last, there = (float(line.intercept + line.slope * at) for at in places)
+            forces = (level_force.min(), level_force.max(), force)
+            first, last, there = (float(line.intercept + line.slope * at) for at in forces)
             trends.append(LevelTrend(kind, first, last, there, float(line.pvalue)))
     return tuple(trends)

@@ -1,4 +1,4 @@
-"""A resonance under a force that was not measured, as a distribution: whether, and where."""
+"""Distribution of the resonance under a force that was not measured."""
 
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
@@ -19,58 +19,60 @@ from snrmjax.numerics.units import HERTZ
 
 QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
 _DRAWS = 4000
-_POINTS = 201  # amplitudes of each drawn curve
-# One law in so many ends with the data: damping stays what it was at the largest amplitude.
-_HELD = 20
-_FEWEST = 40  # draws with a resonance, of which quantiles are told
+_POINTS = 201  # amplitudes of each sampled curve
+# One draw in so many has constant damping beyond the largest measured amplitude: prior 5 %.
+_CONSTANT_BEYOND = 20
+_FEWEST = 40  # draws with a resonance, below which no quantiles are reported
 
 
 class ResonanceDistribution(AbstractResult):
-    """Whether a further level has a phase resonance within a range of amplitudes, and where.
+    """Probability and distribution of a new level's phase resonance within an amplitude range.
 
-    Frequency and velocity are quantiles of those draws that have one. The others reach the end of
-    the range and ask for more force still: their resonance lies beyond, and is not denied.
+    Frequency and velocity are quantiles of the draws with a resonance in the range. The other draws
+    reach the end of the range at less than this force: their resonance lies beyond it.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("quantile",)
 
     force: float = setting()  # N
-    drive: float | None  # what the test records of it, where that was asked for
-    largest_amplitude_ratio: float = setting()  # the range, in largest measured amplitudes
+    drive: float | None  # its record, where requested
+    largest_amplitude_ratio: float = (
+        setting()
+    )  # end of the range over the largest measured amplitude
     probability: float = setting()  # that the resonance lies within the range
     frequency: Float[np.ndarray, " quantile"] = quantity("quantile", "Hz", "frequency")
-    # As the level would record it.
+    # As the level would be recorded.
     velocity: Float[np.ndarray, " quantile"] = quantity("quantile", "m/s", "velocity")
-    negative_damping: float = setting()  # share of the curves left out: none is passive
-    another_day: bool  # whether the errors are another day's too
+    negative_damping: float = setting()  # fraction of draws rejected as not passive
+    another_day: bool  # whether day-to-day variation is included
 
     @property
     def frequency_std(self) -> float:
-        """1σ of the frequency (rad/s) of those draws: half of the range that holds 68 %."""
+        """1σ of the frequency (rad/s): half of the 68 % interval."""
         return float(self.frequency[3] - self.frequency[1]) / 2
 
     @property
     def velocity_std(self) -> float:
-        """The same of the velocity, m/s."""
+        """1σ of the velocity (m/s): half of the 68 % interval."""
         return float(self.velocity[3] - self.velocity[1]) / 2
 
     @property
     def holds(self) -> Fact:
-        """Which errors the quantiles hold."""
+        """Which errors the quantiles include."""
         return Fact("errors_of_a_level", another_day=self.another_day)
 
     def variables(self) -> dict[str, Variable]:
         """Frequency and velocity at `QUANTILES`."""
-        quantile = Variable(("quantile",), np.array(QUANTILES), "1", "share below")
+        quantile = Variable(("quantile",), np.array(QUANTILES), "1", "cumulative probability")
         return {"quantile": quantile, **super().variables()}
 
     def attributes(self) -> dict[str, str | float | int]:
-        """The force, the range, probabilities, and which errors the quantiles hold."""
+        """The force, the range, probabilities, and which errors the quantiles include."""
         return {**super().attributes(), "holds": str(self.holds)}
 
 
 class KnownCurves(NamedTuple):
-    """Both curves along amplitudes, with independent errors of 1σ each."""
+    """Both curves at amplitudes, with their derivatives by independent unit-variance errors."""
 
     values: Float[np.ndarray, "point curve"]  # ω̃² and 2ζ̃ω̃
     errors: Float[np.ndarray, "point curve error"]
@@ -79,7 +81,7 @@ class KnownCurves(NamedTuple):
 
 
 def amplitudes_to(largest: float, ratio: float) -> Float[np.ndarray, " point"]:
-    """Amplitudes of drawn curves, closer to one another the smaller they are."""
+    """Amplitudes of sampled curves, denser at small amplitudes."""
     return ratio * largest * np.linspace(0.0, 1.0, _POINTS)[1:] ** 2
 
 
@@ -94,22 +96,22 @@ def resonance_distribution(
     gain_of_force: bool = False,
     self_excited: bool = False,
 ) -> ResonanceDistribution:
-    """Draw curves, a further level's errors with them, and look where each has its resonance.
+    """Sample curves and a new level's errors, and solve each sample for its resonance.
 
-    A level whose phase errs by ψ records its resonance where tan ψ = (Ω² − ω̃²)/(Ωδ), and then
-    needs X Ω δ/cos ψ = |A|F; the smallest such amplitude is taken. Beyond the data the damping of a
-    passive structure stays positive: draws that fall below zero before they have a resonance are
-    left out; one law in twenty ends with the data, and damping stays as it is there.
+    A level with phase error ψ records its resonance where tan ψ = (Ω² − ω̃²)/(Ωδ), which requires
+    X Ω δ/cos ψ = |A|F; the smallest such amplitude is used. The damping of a passive structure
+    stays positive beyond the data: samples that become negative before their resonance are
+    rejected; in one of twenty the damping is constant beyond the data.
 
     Arguments: `force` in N; `amplitude` up to `ratio` times the largest measured one; `other`
-    is the velocity of the other modes in units of the mode's own direction; with `gain_of_force` a
-    level's gain is that of its recorded force, else of its velocity.
+    is the velocity of the other modes, in phase with the mode's own; with `gain_of_force` the level
+    gain scales its recorded force, else its velocity.
     """
     rng, edge = np.random.default_rng(0), int(np.searchsorted(amplitude, amplitude[-1] / ratio))
     gain, phase, stiffness, loss = (new.std * rng.normal(size=(_DRAWS, len(new.std)))).T
     error = rng.normal(size=(_DRAWS, curves.errors.shape[-1]))
     squared, damping = (curves.values.T[k] + error @ curves.errors[:, k].T for k in range(2))
-    damping[::_HELD, edge:] = damping[::_HELD, edge, None]
+    damping[::_CONSTANT_BEYOND, edge:] = damping[::_CONSTANT_BEYOND, edge, None]
     of_force = gain if gain_of_force and new.drive is not None else 0 * gain
     load = np.exp(error @ curves.load_errors + of_force) * np.cos(phase)
     squared, damping = squared * np.exp(stiffness)[:, None], damping * np.exp(loss)[:, None]
@@ -118,7 +120,7 @@ def resonance_distribution(
     omega = natural + 0.5 * damping * np.tan(phase)[:, None]
     speed = amplitude * omega
     root = _Root.of(speed * damping / (load[:, None] * curves.load))
-    kept = root.found | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
+    kept = root.reached | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
     at, of_mode = root.at(omega), root.at(speed, at_rest=0.0)
     recorded = np.exp(0 * gain if gain_of_force else gain)
     known = np.isfinite(at)
@@ -139,62 +141,62 @@ def resonance_distribution(
 
 
 class _Root(NamedTuple):
-    """Where rows that start at zero first reach one, between two amplitudes."""
+    """First crossing of one by rows that start at zero, by linear interpolation."""
 
-    place: np.ndarray  # of the first amplitude beyond
-    fraction: np.ndarray  # of the way back from there
-    found: np.ndarray
+    position: np.ndarray  # first amplitude beyond the crossing
+    fraction: np.ndarray  # distance back from there, over the step
+    reached: np.ndarray
 
     @classmethod
     def of(cls, needed: Float[np.ndarray, "draw point"]) -> "_Root":
-        rows, place = np.arange(len(needed)), np.argmax(needed >= 1, axis=1)
-        here = needed[rows, place] - 1
-        before = np.where(place > 0, needed[rows, place - 1], 0.0) - 1
-        return cls(place, here / (here - before), here >= 0)
+        rows, position = np.arange(len(needed)), np.argmax(needed >= 1, axis=1)
+        here = needed[rows, position] - 1
+        before = np.where(position > 0, needed[rows, position - 1], 0.0) - 1
+        return cls(position, here / (here - before), here >= 0)
 
     def at(
         self, values: Float[np.ndarray, "draw point"], at_rest: float | None = None
     ) -> Float[np.ndarray, " draw"]:
         rows = np.arange(len(values))
-        here, before = values[rows, self.place], values[rows, np.maximum(self.place - 1, 0)]
+        here, before = values[rows, self.position], values[rows, np.maximum(self.position - 1, 0)]
         if at_rest is not None:
-            before = np.where(self.place > 0, before, at_rest)
-        return np.where(self.found, here + self.fraction * (before - here), np.nan)
+            before = np.where(self.position > 0, before, at_rest)
+        return np.where(self.reached, here + self.fraction * (before - here), np.nan)
 
 
 def other_modes(
     modes: LinearModes, sensor: int, force: float
 ) -> Callable[[Float[np.ndarray, " draw"]], Complex[np.ndarray, " draw"]]:
-    """Velocity of the other modes at frequencies, in the direction of the mode's own motion."""
+    """Velocity of the other modes at frequencies, in phase with the mode's own motion."""
     shape = modes.mode_shape[sensor, modes.mode_of_interest]
     sign = np.sign(float(shape * participation_of(modes)))
 
     def velocity(frequency: np.ndarray) -> np.ndarray:
         load = jnp.full(frequency.shape, force)
-        beside = np.asarray(residual_velocity(modes, jnp.asarray(frequency), load))[:, sensor]
-        return sign * beside * np.asarray(sensed_mode(modes, frequency).to_mode(sensor))
+        others = np.asarray(residual_velocity(modes, jnp.asarray(frequency), load))[:, sensor]
+        return sign * others * np.asarray(sensed_mode(modes, frequency).to_mode(sensor))
 
     return velocity
 
 
 def covariance_root(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """A matrix R with RRᵀ the covariance, which may be singular."""
-    size, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(size, 0.0))
+    """R with RRᵀ = covariance, which may be singular."""
+    eigenvalues, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
 
 
-_SURE = 0.975  # probability of a resonance that needs no word
-_WORTH = 0.025  # probability of negative damping that needs one
+_CERTAIN = 0.975  # probability of a resonance that needs no note
+_WORTH = 0.025  # probability of negative damping that needs a note
 
 
 def where_in_words(distribution: ResonanceDistribution) -> Fact:
-    """Whether a further level has the resonance, and its 95 % ranges."""
+    """Probability of the new level's resonance in range, and its 95 % intervals."""
     low, high = (distribution.frequency[[0, -1]] / HERTZ).tolist()
     slow, fast = distribution.velocity[[0, -1]].tolist()
     return Fact(
         "resonance_of_a_level",
         probability=distribution.probability,
-        sure=distribution.probability >= _SURE,
+        sure=distribution.probability >= _CERTAIN,
         ratio=distribution.largest_amplitude_ratio,
         frequency_hz=(low, high),
         velocity=(slow, fast),
@@ -203,14 +205,14 @@ def where_in_words(distribution: ResonanceDistribution) -> Fact:
 
 
 def notes_on_resonance(distribution: ResonanceDistribution, load: Fact) -> list[Fact]:
-    """Which curves were left out."""
+    """Which fraction of the sampled curves was rejected as not passive."""
     if not distribution.negative_damping > _WORTH:
         return []
     return [Fact("negative_damping_left_out", load=load, fraction=distribution.negative_damping)]
 
 
 def notes_on_trends(trends: Sequence[LevelTrend], load: Fact) -> list[Fact]:
-    """Which errors of levels change steadily with their force, and what that comes to."""
+    """Level errors with a significant trend in force, and their value at this one."""
     return [
         Fact(
             "levels_follow_force",
@@ -225,7 +227,7 @@ def notes_on_trends(trends: Sequence[LevelTrend], load: Fact) -> list[Fact]:
 
 
 def notes_on_negative_damping(values: BackboneValues) -> list[Fact]:
-    """Where a curve of damping, or its band, is below zero."""
+    """Where the damping curve or its band is negative."""
     ratio, std = np.asarray(values.damping_ratio), np.asarray(values.damping_ratio_std)
     known = np.isfinite(ratio) & np.isfinite(std) & (std > 0)
     below = np.where(known, ndtr(-ratio / np.where(known, std, 1.0)), ratio < 0)

@@ -9,14 +9,14 @@ from snrmjax.identify.modal.modal_fit import WIDE, LinearModalFit
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
 
-_SHIFT_STDS = 3.0  # standard errors of a shift, without which it gives no scale
-_LARGE = 0.1  # relative shift of frequency, beyond which the shapes change too
+_SHIFT_STDS = 3.0  # smallest significant frequency shift, in standard errors
+_LARGE = 0.1  # relative frequency shift above which the mass also changes the shapes
 _STEP = 1e-7
-_BY_BAND = "narrow the band to modes that both show, or give the poles of these by hand"
+_BY_BAND = "narrow the band to modes that both tests show, or give their poles by hand"
 
 
 class SquaredShapes(NamedTuple):
-    """φ² at the mass, 1/kg, one a mode."""
+    """φ² at the added mass, 1/kg, for each mode."""
 
     squared: Float[np.ndarray, " mode"]
     squared_std: Float[np.ndarray, " mode"]
@@ -26,16 +26,15 @@ class SquaredShapes(NamedTuple):
 def squared_shapes(
     without: LinearModalFit, with_mass: LinearModalFit, mass: float, mass_std: float = 0.0
 ) -> SquaredShapes:
-    """φ² where a mass Δm is added, from ω₀ without and ω₁ with it.
+    """φ² at an added mass Δm, from the frequencies ω₀ without and ω₁ with it.
 
-    The mass answers with the force Δm Ω² x: Σ_k φ_k²/(ω₀k² − ω₁r²) = 1/(Δm ω₁r²) for every mode r
-    with the mass. One mode alone: φ² = (ω₀²/ω₁² − 1)/Δm, exact as long as the mass does not
-    change the shape. To first order φ² = 2(ω₀ − ω₁)/(ω₀Δm), too small by about the share
-    3/2 (ω₀ − ω₁)/ω₀.
-    Errors of both frequencies and of the mass are carried.
+    The inertia force of the mass is Δm Ω² x: Σ_k φ_k²/(ω₀k² − ω₁r²) = 1/(Δm ω₁r²) for every mode r
+    with the mass. One mode alone: φ² = (ω₀²/ω₁² − 1)/Δm, exact if the mass does not change
+    the shape. To first order φ² = 2(ω₀ − ω₁)/(ω₀Δm), too small by the relative amount
+    3/2 (ω₀ − ω₁)/ω₀. Errors of both frequencies and of the mass are propagated.
 
-    Raises `ValueError` for a mass that is not positive, another number of modes, and frequencies
-    that the mass does not lower by three standard errors.
+    Raises `ValueError` for a mass that is not positive, fewer modes with the mass, and frequencies
+    that the mass does not lower by at least three standard errors.
     """
     if not (np.isfinite(mass) and mass > 0 and mass_std >= 0):
         raise ValueError(f"an added mass must be positive (kg), but is {mass:g} ± {mass_std:g}.")
@@ -48,7 +47,7 @@ def squared_shapes(
                 f"the added mass of {mass:.4g} kg must lower the frequency of mode {k + 1}, but "
                 f"it goes from {before[k] / HERTZ:.7g} to {after[k] / HERTZ:.7g} Hz, "
                 f"{shift[k] / HERTZ:.2g} ± {WIDE * spread[k] / HERTZ:.2g} Hz (95 %) lower: take "
-                "a larger mass, or a place that moves more."
+                "a larger mass, or a position that moves more."
             )
     squared = _solved(before, after, mass)
     if np.any(squared <= 0):
@@ -88,7 +87,7 @@ def _solved(before: np.ndarray, after: np.ndarray, mass: float) -> np.ndarray:
 
 
 def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies with the mass, one for each mode without it."""
+    """Frequencies with the mass and their 1σ, one for each mode without it."""
     before, after = without.natural_frequency, with_mass.natural_frequency
     if len(after) == len(before):
         return after, with_mass.natural_frequency_std
@@ -97,7 +96,7 @@ def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.nd
             f"the test with the added mass must show the {len(before)} modes of the test without "
             f"it, but shows {len(after)}: {_BY_BAND}."
         )
-    # A mass lowers each frequency, and not below the next lower one.
+    # A mass lowers each frequency, but not below the next lower one (interlacing).
     chosen = [
         int(np.argmin(np.where(after <= frequency, frequency - after, np.inf)))
         for frequency in before

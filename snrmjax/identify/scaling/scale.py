@@ -1,4 +1,4 @@
-"""Residues into mass-normalised shapes: by drive point, added mass, masses or a known shape."""
+"""Mass-normalised shapes from residues: by drive point, added mass, masses or a known shape."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -14,28 +14,28 @@ from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 
 _PER = {"force": "N", "voltage": "V", "acceleration": "m/s²"}
-_RESIDUE_STDS = 3.0  # standard errors of a drive point's residue, without which it gives no scale
+_RESIDUE_STDS = 3.0  # smallest significant drive-point residue, in standard errors
 _DRIVE_NAMES = ("drive_point", "drive point", "driving_point", "driving point")
 
 
 class _Scaled(NamedTuple):
-    """Participations and how they hang on what was fitted."""
+    """Participations and their sensitivity to the fitted residues."""
 
     participation: Float[np.ndarray, " mode"]
-    relative_std: Float[np.ndarray, " mode"]  # of it, beside the residues' errors
+    relative_std: Float[np.ndarray, " mode"]  # of it, in addition to the residues' errors
     by_residues: Float[np.ndarray, "mode sensor"]  # d ln p / d residue
     keep: Bool[np.ndarray, " mode"]
     by: Fact
     notes: tuple[Fact, ...]
-    # An error of response over force enters ln φ with this exponent and ln p with the rest.
+    # A relative error of response over force enters φ to this power, and p to one minus it.
     exponent: float
 
 
 class DrivePoint(NamedTuple):
     """Scale by the sensor at the force: its residue is φ².
 
-    `sensor` None: the one whose point and axis are the force's. `turned` says that it points
-    against the force.
+    `sensor` None: the one at the point and axis of the force. `turned`: the sensor points in the
+    direction opposite to the force.
     """
 
     sensor: str | None = None
@@ -49,24 +49,24 @@ class DrivePoint(NamedTuple):
                 f"{fit.reference.quantity} of a base: give sensor masses, an added mass or a known "
                 "shape."
             )
-        d, sign = self._place(fit)
+        d, sign = self._sensor_and_sign(fit)
         drive_residue = sign * residue[d]
         std = fit.residue_std[d] * np.abs(residue[d] / fit.residue[d])
         sure = np.abs(drive_residue) > _RESIDUE_STDS * std
         hertz = fit.natural_frequency / 2 / np.pi
         if np.all(drive_residue[sure] < 0) and sure.any():
-            way = "leave out" if self.turned else "say"
-            way = f"{way} that the sensor is turned"
+            advice = "leave out" if self.turned else "state"
+            advice = f"{advice} that the sensor is turned"
             raise ValueError(
                 f"the residues at the drive point {fit.sensor_names[d]} are negative "
                 f"({drive_residue[sure][0]:.4g} 1/kg at {hertz[sure][0]:.6g} Hz): sensor and force "
-                f"point against one another; {way}, or change a sign."
+                f"have opposite directions; {advice}, or change a sign."
             )
         keep = sure & (drive_residue > 0)
         if not keep.any():
             raise ValueError(
                 f"the residues at the drive point {fit.sensor_names[d]} are within three standard "
-                "errors of zero: it lies at a node of all modes and gives no scale."
+                "errors of zero: it is at a node of all modes and gives no scale."
             )
         left_out = np.stack([hertz, drive_residue, std], axis=1)[~keep].tolist()
         notes = tuple(
@@ -78,19 +78,19 @@ class DrivePoint(NamedTuple):
         slopes = 0.5 * _by_one(residue, d)
         return _Scaled(participation, np.zeros(len(drive_residue)), slopes, keep, by, notes, 0.5)
 
-    def _place(self, fit: LinearModalFit) -> tuple[int, float]:
-        """The sensor's number, and its sign against the force."""
+    def _sensor_and_sign(self, fit: LinearModalFit) -> tuple[int, float]:
+        """Index of the sensor, and its sign relative to the force."""
         sign = -1.0 if self.turned else 1.0
         if self.sensor is not None:
             return fit.sensor_number(self.sensor), sign
-        place = _drive_point_of(fit)
-        if place is None:
+        drive = _drive_point_of(fit)
+        if drive is None:
             raise ValueError(
                 "the shapes cannot be mass-normalised: no sensor is known to be where the force "
                 f"acts (by points and axes of {', '.join(fit.sensor_names)}); name that sensor, or "
                 "give an added mass, sensor masses or a known shape."
             )
-        return place[0], sign * place[1]
+        return drive[0], sign * drive[1]
 
 
 class AddedMassTest(NamedTuple):
@@ -103,13 +103,13 @@ class AddedMassTest(NamedTuple):
 
     def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
         """p = A/φ with φ from the shift of the frequencies."""
-        place = fit.sensor_number(self.sensor)
+        sensor = fit.sensor_number(self.sensor)
         squares = squared_shapes(fit, self.with_mass, self.mass, self.mass_std)
         shape = np.sqrt(squares.squared)
         return _Scaled(
-            residue[place] / shape,
+            residue[sensor] / shape,
             0.5 * squares.squared_std / squares.squared,
-            _by_one(residue, place),
+            _by_one(residue, sensor),
             np.ones(len(shape), dtype=bool),
             Fact("scaled_by_added_mass", mass_kg=self.mass, sensor=self.sensor),
             squares.notes,
@@ -118,19 +118,19 @@ class AddedMassTest(NamedTuple):
 
 
 class SensorMasses(NamedTuple):
-    """Scale by the mass, kg, that each sensor's motion stands for.
+    """Scale by the mass, kg, lumped at each sensor.
 
-    Over a base's acceleration Σ mφ = Γ. With `fixture_mass` the force acts on a rigid free fixture
-    of that mass, and its motion in a mode balances the sensors': φ_f = −Σ mφ/m_f.
+    Over a base acceleration Σ mφ = Γ. With `fixture_mass` the force acts on a free rigid fixture of
+    that mass, whose motion in a mode balances that of the sensors: φ_f = −Σ mφ/m_f.
     """
 
     mass: Mapping[str, float]
     fixture_mass: float | None = None
 
     def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
-        """p² = −Σ m A, over the fixture's mass where that is forced."""
+        """p² = −Σ m A, divided by the mass of a forced fixture."""
         if not self.mass:
-            raise ValueError("a fixture's mass scales only with the masses at the sensors.")
+            raise ValueError("a fixture mass needs the masses at the sensors as well.")
         mass = np.zeros(len(residue))
         for name, value in self.mass.items():
             if not (np.isfinite(value) and value >= 0):
@@ -143,8 +143,8 @@ class SensorMasses(NamedTuple):
         base = fit.reference.quantity == "acceleration"
         if not base and self.fixture_mass is None:
             raise ValueError(
-                "sensor masses scale the response to a base's motion, or with the mass of a free "
-                f"rigid fixture that to a force: the reference {fit.reference.name} is "
+                "sensor masses scale the response to base motion or, with the mass of a free rigid "
+                f"fixture, that to a force: the reference {fit.reference.name} is "
                 f"{fit.reference.quantity}, and no fixture mass is stated."
             )
         if self.fixture_mass is not None and not self.fixture_mass > 0:
@@ -158,18 +158,18 @@ class SensorMasses(NamedTuple):
             raise ValueError(
                 f"Σ mass × residue must be negative for a structure moved by its base, but is "
                 f"{total[k]:.3g} at {fit.natural_frequency[k] / 2 / np.pi:.6g} Hz: a sensor is "
-                "turned, or the responses are absolute where relative ones were said."
+                "turned, or the responses are absolute but were declared relative."
             )
-        size = np.sqrt(-total / fixture)
+        participation = np.sqrt(-total / fixture)
         note = Fact("forced_fixture", mass_kg=fixture)
         if base:
             masses = tuple((-total).tolist())
             note = Fact("effective_masses", masses_kg=masses, at_sensors_kg=float(mass.sum()))
         return _Scaled(
-            -size if base else size,
-            np.zeros(len(size)),
+            -participation if base else participation,
+            np.zeros(len(participation)),
             0.5 * mass[None] / total[:, None],
-            np.ones(len(size), dtype=bool),
+            np.ones(len(participation), dtype=bool),
             Fact("scaled_by_sensor_masses"),
             (note,),
             0.5,
@@ -177,7 +177,7 @@ class SensorMasses(NamedTuple):
 
 
 class KnownShape(NamedTuple):
-    """Scale by a mass-normalised shape that is known, as from finite elements, at one sensor."""
+    """Scale by a known mass-normalised shape at one sensor, for example from finite elements."""
 
     sensor: str
     value: float  # kg^-1/2, of every mode
@@ -185,7 +185,7 @@ class KnownShape(NamedTuple):
 
     def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
         """p = A/φ."""
-        place, n = fit.sensor_number(self.sensor), residue.shape[1]
+        sensor, n = fit.sensor_number(self.sensor), residue.shape[1]
         if not np.isfinite(self.value) or self.value == 0:
             raise ValueError(
                 f"the known shape at {self.sensor} must be finite and not zero, but is "
@@ -193,9 +193,9 @@ class KnownShape(NamedTuple):
             )
         note = Fact("shape_for_all_modes", value=self.value, sensor=self.sensor)
         return _Scaled(
-            residue[place] / self.value,
+            residue[sensor] / self.value,
             np.full(n, abs(self.std / self.value)),
-            _by_one(residue, place),
+            _by_one(residue, sensor),
             np.ones(n, dtype=bool),
             Fact("scaled_by_known_shape", sensor=self.sensor),
             () if n == 1 else (note,),
@@ -207,17 +207,17 @@ Scale = DrivePoint | AddedMassTest | SensorMasses | KnownShape
 
 
 class Free(NamedTuple):
-    """A structure free to move as a rigid body; of a known mass, kg, if it is weighed."""
+    """A structure free to move as a rigid body, with its mass in kg if known."""
 
     mass: float | None = None
 
 
 class Calibration(NamedTuple):
-    """What is known of the measuring chain beside the residues' own errors."""
+    """Calibration of the measuring chain, in addition to the residues' errors."""
 
     newtons_per_volt: float | None = None
     newtons_per_volt_std: float = 0.0
-    relative_std: float = 0.0  # of response over force, all modes alike
+    relative_std: float = 0.0  # of response over force, common to all modes
 
 
 @on_numbers("Differentiate `sj.model.linear_response`.")
@@ -230,20 +230,20 @@ def scale_modes(
 ) -> ScaledModes:
     """Mass-normalised shapes φ and participations p from residues A = φp.
 
-    Drive point: p = √A_d, where the sensor moves with the force. Added mass Δm at a sensor:
-    φ² = (ω₀²/ω₁² − 1)/Δm for one mode, and from the whole set of modes where there are more.
-    Sensor masses over a base's acceleration: p = −Γ with Γ² = −Σ m A; under a free rigid fixture
-    m_f that is forced: p² = −Σ m A/m_f. A known shape: p = A/φ.
-    Signs: a participation is positive, over a base's acceleration negative (the force is −Γa).
+    Drive point: p = √A_d, at the sensor where the force acts. Added mass Δm at a sensor:
+    φ² = (ω₀²/ω₁² − 1)/Δm for one mode; several modes are solved together.
+    Sensor masses over a base acceleration: p = −Γ with Γ² = −Σ m A; with a forced rigid fixture
+    m_f: p² = −Σ m A/m_f. A known shape: p = A/φ.
+    Signs: participations are positive, over a base acceleration negative (the force is −Γa).
 
-    Arguments: `by` None gives relative shapes, ±1 at the largest sensor; p then has the size of the
-    residue there, so that φp = A at every sensor. Free decays tell no residue: their p is one.
+    Arguments: `by` None gives relative shapes, ±1 at the largest sensor; p then is the magnitude of
+    the residue there, so that φp = A at every sensor. Free decays have no residue: p is one.
     `calibration` has newtons per volt where the reference is a voltage; `free` adds the rigid-body
-    mode that the low residuals show, or that of a stated mass.
+    mode from the low residuals, or that of a stated mass.
     Returns `ScaledModes`; modes that hardly move the drive point are left out, with a note.
-    Raises `ValueError` in a sentence where a scale cannot be had: no sensor at the force, a
-    voltage without newtons per volt, a free decay, a negative residue at the drive point (a sensor
-    turned), an added mass that does not lower the frequencies, a mass below zero, an unknown
+    Raises `ValueError` where no scale can be derived: no sensor at the force, a voltage without
+    newtons per volt, a free decay, a negative residue at the drive point (reversed sensor), an
+    added mass that does not lower the frequencies, a mass below zero, an unknown
     sensor.
     Not differentiable: differentiate `snrmjax.model.linear_response`.
     Reference: Ewins, Modal Testing, 2nd ed. (2000), chapters 2 and 5; for the added mass Parloo,
@@ -268,8 +268,8 @@ def scale_modes(
     if by is None:
         slopes = np.eye(len(residue))[top] / largest[:, None]
         p = -np.abs(largest) if fit.reference.quantity == "acceleration" else np.abs(largest)
-        size = p, np.hypot(of_largest, chain)
-        return _unscaled(fit, _shapes(residue, covariance, p, slopes), size, per)
+        participations = p, np.hypot(of_largest, chain)
+        return _unscaled(fit, _shapes(residue, covariance, p, slopes), participations, per)
     scaled = by.scaled(fit, residue)
     p, slopes, keep = scaled.participation, scaled.by_residues, scaled.keep
     shape, spread = _shapes(residue, covariance, p, slopes)
@@ -300,7 +300,7 @@ def scale_modes(
 
 
 def _by_one(residue: np.ndarray, sensor: int) -> Float[np.ndarray, "mode sensor"]:
-    """Slopes of ln p where it goes with one sensor's residue."""
+    """d ln p / d residue where p is proportional to one sensor's residue."""
     slopes = np.zeros(residue.T.shape)
     slopes[:, sensor] = 1 / residue[sensor]
     return slopes
@@ -309,7 +309,7 @@ def _by_one(residue: np.ndarray, sensor: int) -> Float[np.ndarray, "mode sensor"
 def _shapes(
     residue: np.ndarray, covariance: np.ndarray, participation: np.ndarray, slopes: np.ndarray
 ) -> tuple[Float[np.ndarray, "sensor mode"], Float[np.ndarray, "sensor mode"]]:
-    """φ = A/p and its 1σ by the residues' errors; `slopes` are those of ln p by the residues."""
+    """φ = A/p and its 1σ from the residues' errors; `slopes` are d ln p / d residue."""
     shape = residue / participation
     sensitivities = np.eye(len(residue)) / participation[:, None, None]
     sensitivities = sensitivities - shape.T[:, :, None] * slopes[:, None, :]
@@ -323,7 +323,7 @@ def _unscaled(
     participations: tuple[np.ndarray, np.ndarray],
     per: str,
 ) -> ScaledModes:
-    """Modes with relative shapes: nothing gives their scale.
+    """Modes with relative shapes, without a scale.
 
     Arguments: shapes with their 1σ; participations with the relative 1σ of the residues.
     """
@@ -350,12 +350,12 @@ def _unscaled(
 
 
 def _drive_point_of(fit: LinearModalFit) -> tuple[int, float] | None:
-    """The sensor at the force, by point and axis or by a name that says so, and its sign."""
-    point, way = fit.reference.point, fit.reference.direction
+    """The sensor at the force, by point and axis or by its name, and its sign."""
+    point, axis = fit.reference.point, fit.reference.direction
     for k, sensor in enumerate(fit.sensors):
-        same_axis = sensor.direction.lstrip("+-") == way.lstrip("+-")
+        same_axis = sensor.direction.lstrip("+-") == axis.lstrip("+-")
         if point and sensor.point == point and same_axis:
-            return k, 1.0 if sensor.direction.startswith("-") == way.startswith("-") else -1.0
+            return k, 1.0 if sensor.direction.startswith("-") == axis.startswith("-") else -1.0
     named = [k for k, name in enumerate(fit.sensor_names) if name.lower() in _DRIVE_NAMES]
     return (named[0], 1.0) if named else None
 
@@ -371,7 +371,7 @@ def _newtons(
         if gain is None and isinstance(by, DrivePoint | SensorMasses):
             raise ValueError(
                 "the shapes cannot be mass-normalised: the drive is known in volts only, and "
-                "newtons per volt are not stated (an added mass or a known shape would do, too)."
+                "newtons per volt are not stated (an added mass or a known shape would also do)."
             )
         if gain is not None and not (np.isfinite(gain) and gain > 0):
             raise ValueError(f"newtons per volt must be positive, but are {gain:g}.")

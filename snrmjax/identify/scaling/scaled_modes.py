@@ -1,4 +1,4 @@
-"""Modes as a model takes them: shapes, participations, errors, rigid-body mode."""
+"""Linear modes for a model: shapes, participations, errors, rigid-body mode."""
 
 from typing import ClassVar, NamedTuple
 
@@ -7,7 +7,13 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.modal.modal_fit import WIDE, LinearModalFit
-from snrmjax.model.modes import Beside, LinearModes, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.model.modes import (
+    LinearModes,
+    LinearModesStd,
+    OptionalModalData,
+    RigidBodyModes,
+    linear_modes,
+)
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
@@ -17,10 +23,10 @@ from snrmjax.numerics.units import HERTZ
 class ScaledModes(AbstractResult):
     """Linear modes with shapes and participations; see `scale_modes`.
 
-    `per` is the unit of what drives them: a participation is Φᵀb per newton, or per m/s² of a base,
-    or per volt. `mass_normalised` is False where nothing gave the scale: then each shape is ±1 at
-    its largest sensor, and shape times participation is the fitted residue all the same, but for
-    free decays, which have none.
+    `per` is the unit of the excitation: a participation is Φᵀb per newton, per m/s² of a base or
+    per volt. `mass_normalised` is False without a scale: each shape is then ±1 at its largest
+    sensor; shape times participation is still the fitted residue, except for free decays, which
+    have none.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("mode", "sensor")
@@ -52,7 +58,7 @@ class ScaledModes(AbstractResult):
     def linear_modes(self, interest: int = 0) -> LinearModes:
         """The modes of a model; `interest` counts from zero.
 
-        Raises `ValueError` for a mode of interest that is not there.
+        Raises `ValueError` for a mode of interest that does not exist.
         """
         if not 0 <= interest < self.n_modes:
             raise ValueError(
@@ -78,7 +84,7 @@ class ScaledModes(AbstractResult):
                 self.damping_ratio_std,
                 self.modal_mass_std if known else None,
             ),
-            beside=Beside(base=self.base),
+            beside=OptionalModalData(base=self.base),
         )
 
     def summary(self) -> tuple[str, ...]:
@@ -111,12 +117,14 @@ class ScaledModes(AbstractResult):
         }
 
 
-_RESIDUAL_STDS = 5.0  # standard errors of a low residual
-_APART = 1.2  # ratio of the residual's mass and the stated one that is worth a note
+_RESIDUAL_STDS = 5.0  # smallest significant low residual, in standard errors
+_APART = (
+    1.2  # ratio of the residual's mass to the stated one above which the note reports a difference
+)
 
 
 class RigidBodyMode(NamedTuple):
-    """Shape at the sensors and participation, both kg^-1/2; no shape where none is due."""
+    """Shape at the sensors and participation, both kg^-1/2; no shape for a fixed structure."""
 
     shape: Float[np.ndarray, " sensor"] | None
     participation: float
@@ -130,28 +138,32 @@ def rigid_body_mode(
     drive: tuple[int, float] | None,
     scaled_by: Fact,
 ) -> RigidBodyMode:
-    """What the low residuals, or the stated mass of a free structure, say of its rigid motion.
+    """The rigid-body mode from the low residuals or from the stated mass of a free structure.
 
-    A rigid-body mode answers −φp/Ω²: the low residual of the drive point is −1/m of the mass that
-    the force feels. Modes below the band look alike, so that it is written only where the
-    structure is said to be free: `free` is its mass in kg, 0 where it is not known, None where
-    nobody said. `drive` is the number of the sensor at the force and its sign against it.
-    Raises `ValueError` where a free structure's residual refutes that.
+    A rigid-body mode has the receptance −φp/Ω²: the low residual of the drive point is −1/m, m the
+    driven mass. Modes below the band look alike, so that the mode is added only for a structure
+    declared free: `free` is its mass in kg, 0 if unknown, None if not declared. `drive` is the
+    index of the sensor at the force and its sign relative to it.
+    Raises `ValueError` where the residual contradicts a free structure.
     """
     lower, std = fit.lower / gain, fit.lower_std / abs(gain)
     at, sign = drive or (0, 1.0)
     residual = residual_std = np.nan
     if drive is not None and std[at] > 0:
         residual, residual_std = sign * lower[at], std[at]
-    shows = residual < -_RESIDUAL_STDS * residual_std
+    significant = residual < -_RESIDUAL_STDS * residual_std
     if free is None:
-        note = (Fact("low_residual_of_free_mass", mass_kg=float(-1 / residual)),) if shows else ()
+        note = (
+            (Fact("low_residual_of_free_mass", mass_kg=float(-1 / residual)),)
+            if significant
+            else ()
+        )
         return RigidBodyMode(None, 0.0, note)
     if free < 0 or not np.isfinite(free):
         raise ValueError(f"the mass of a free structure must be positive (kg), but is {free:g}.")
     if free > 0:
         ones = np.full(len(fit.sensors), free**-0.5)
-        if not shows:
+        if not significant:
             return RigidBodyMode(ones, free**-0.5, (Fact("rigid_body_of_stated_mass"),))
         ratio = float(-1 / residual / free)
         off = not 1 / _APART < ratio < _APART
@@ -159,15 +171,15 @@ def rigid_body_mode(
         signs = np.sign(lower) * np.sign(lower[at])
         ones = ones * np.where(signs == 0, 1.0, signs) * sign
         return RigidBodyMode(ones, free**-0.5, note)
-    if not shows:
+    if not significant:
         what = (
             "is not known"
             if np.isnan(residual)
             else f"is {residual:.3g} ± {WIDE * residual_std:.2g} 1/kg"
         )
         raise ValueError(
-            f"a free structure answers −1/(m Ω²) at low frequency, but the low residual at the "
-            f"drive point {what}: state its mass, or do not call it free."
+            f"a free structure responds with −1/(m Ω²) at low frequency, but the low residual at "
+            f"the drive point {what}: state its mass, or do not declare it free."
         )
     participation = float(np.sqrt(-residual))
     mass = {"mass_kg": float(-1 / residual), "std_kg": float(residual_std / residual**2)}

@@ -1,11 +1,11 @@
 """Smooth curves of amplitude as sums of fixed functions with prior variances.
 
-A straight line over a², and the bends of a natural cubic spline in a²: differences of a value from
-the straight line between those at the next knots, alike likely per step of log amplitude. Their
-size may change along the curve, as levels of a softening arch pass its fold; the functions are the
-same for all sizes, so that they are evaluated once. Beyond the knots a curve is straight in a².
+A straight line in a², and the roughness of a natural cubic spline in a²: the distance of the value
+at a knot from the chord between its neighbours, equally likely per step of log amplitude. The 1σ of
+the roughness may vary along the curve, as where a softening arch folds; the basis functions do not
+depend on it, so they are evaluated once. Beyond the last knot a curve is linear in a².
 References: for the prior, Green & Silverman, Nonparametric Regression and Generalized Linear Models
-(1994), ch. 2; for sizes that vary, Ruppert & Carroll, Aust. N. Z. J. Stat. 42 (2000) 205,
+(1994), ch. 2; for varying roughness, Ruppert & Carroll, Aust. N. Z. J. Stat. 42 (2000) 205,
 doi:10.1111/1467-842X.00119.
 """
 
@@ -16,22 +16,22 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from snrmjax.identify.curves.splines import amplitudes_apart, roughness_of
-from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZES_ALIKE
+from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, ROUGHNESS_LENGTH
 
 MOST_KNOTS = 42
-_BEYOND = (1.15, 1.3)  # knots over the largest amplitude, for levels whose record is too small
-_NEAREST = 1.1  # ratio of two knots' amplitudes
+_BEYOND = (1.15, 1.3)  # knots above the largest amplitude, for levels recorded too small
+_NEAREST = 1.1  # smallest ratio of neighbouring knots' amplitudes
 N_POWERS = 2
-_NO_VARIANCE = 1e-6  # of the largest variance: a direction of the sizes that counts for nothing
+_NO_VARIANCE = 1e-6  # of the largest eigenvalue: directions below it are dropped
 
 
 class CurveBasis(NamedTuple):
-    """The functions for one range of amplitudes."""
+    """The basis functions for one range of amplitudes."""
 
     largest: float  # m
     knots: Float[np.ndarray, " knot"]  # of (a/largest)²
-    pieces: Float[np.ndarray, "4 interval function"]  # of the cubics, from the third power on
-    directions: Float[np.ndarray, "bend direction"]  # of the logarithms of the bends' sizes
+    pieces: Float[np.ndarray, "4 interval function"]  # cubic coefficients, highest power first
+    directions: Float[np.ndarray, "curvature direction"]  # of the log of the roughness' 1σ
 
     @classmethod
     def of(
@@ -41,8 +41,8 @@ class CurveBasis(NamedTuple):
         *,
         crowded: bool = False,
     ) -> "CurveBasis":
-        """For measured amplitudes: knots at rest, at amplitudes of states, and a little beyond;
-        more of them where amplitudes crowd, if asked.
+        """For measured amplitudes: knots at rest, at amplitudes of states, and slightly beyond;
+        with `crowded` also closer ones where states cluster.
         """
         largest = float(np.max(amplitude))
         most = max(most_knots - 1 - len(_BEYOND), 1)
@@ -55,7 +55,8 @@ class CurveBasis(NamedTuple):
         roughness = roughness_of(knots)
         functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(roughness)])
         apart_by = (
-            np.subtract.outer(np.arange(len(roughness)), np.arange(len(roughness))) / SIZES_ALIKE
+            np.subtract.outer(np.arange(len(roughness)), np.arange(len(roughness)))
+            / ROUGHNESS_LENGTH
         )
         values, vectors = np.linalg.eigh(np.exp(-0.5 * apart_by**2))
         keep = values > _NO_VARIANCE * np.max(values, initial=0.0)
@@ -70,18 +71,18 @@ class CurveBasis(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """1σ of what bends of size one add up to at the largest amplitude."""
+        """Prior 1σ at the largest amplitude of a curve with roughness of 1σ = 1."""
         return float(np.linalg.norm(self.values(np.array([self.largest]))[0][0, N_POWERS:]))
 
     @property
     def n_functions(self) -> int:
-        """How many functions there are."""
+        """Number of basis functions."""
         return self.pieces.shape[2]
 
     def values(
         self, amplitude: Float[np.ndarray, " point"]
     ) -> tuple[Float[np.ndarray, "point function"], Float[np.ndarray, "point function"]]:
-        """The functions, and their derivatives by the logarithm of amplitude."""
+        """The basis functions, and their derivatives by the logarithm of amplitude."""
         values, slopes = self.curves(amplitude, np.eye(self.n_functions))
         return values.T, slopes.T
 
@@ -90,7 +91,7 @@ class CurveBasis(NamedTuple):
         amplitude: Float[np.ndarray, " point"],
         coefficients: Float[np.ndarray, "function curve"],
     ) -> tuple[Float[np.ndarray, "curve point"], Float[np.ndarray, "curve point"]]:
-        """Sums of the functions, and their derivatives by the logarithm of amplitude."""
+        """Curves of these coefficients, and their derivatives by the logarithm of amplitude."""
         u = (amplitude / self.largest) ** 2
         k = np.clip(np.searchsorted(self.knots, u, side="right") - 1, 0, len(self.knots) - 2)
         inside = np.minimum(u, self.knots[-1])
@@ -103,8 +104,8 @@ class CurveBasis(NamedTuple):
     def log_variances(
         self,
     ) -> tuple[Float[np.ndarray, " function"], Float[np.ndarray, "function hyper"]]:
-        """ln of the prior variances of straight functions, and for bends of size one that does not
-        change; what they gain by ln of the size, and by how it changes.
+        """ln of the prior variances of the linear functions, and of roughness of constant 1σ = 1;
+        and their slopes by ln of that 1σ and by its variation along the curve.
         """
         powers = 2 * np.log([CURVE_CONSTANT, CURVE_SLOPES])
         slopes = np.zeros((self.n_functions, 1 + self.directions.shape[1]))

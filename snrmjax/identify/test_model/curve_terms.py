@@ -1,9 +1,9 @@
-"""What each of a test's two curves is a sum of: a family's own terms, and smooth functions.
+"""The terms of each of a test's two curves: those of a family, and smooth functions.
 
 Without a family the smooth functions are the curve. With one they are its remainder: a straight
-line in a² and bends, all of one size, which is exactly zero or found by the evidence. Terms of a
-family that are not linear in their parameters (an exponent) are linearised about their present
-values, in the same rounds as everything else.
+line in a² and roughness with one common 1σ, either exactly zero or estimated by the evidence. A
+family that is nonlinear in a parameter (an exponent) is linearised about its current value, in the
+same Gauss–Newton iterations as everything else.
 """
 
 from typing import NamedTuple
@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument
 from snrmjax.identify.test_model.curve_basis import CurveBasis
 
-_WIDE = 1e8  # 1σ of a family's coefficients, in the curve's unit: no prior at all
+_WIDE = 1e8  # 1σ of a family's coefficients, in the curve's unit: a flat prior
 
 
 class CurveTerms(NamedTuple):
-    """The terms of one curve, by coefficients that are the modal mass over the model's times it.
+    """The terms of one curve; their coefficients are of the curve times κ, the modal mass ratio.
 
-    Those of a family come first; they have its own numbers (an exponent) as they are.
+    Those of a family come first; its dimensionless parameters (an exponent) are not scaled.
     """
 
     basis: CurveBasis
@@ -31,29 +31,29 @@ class CurveTerms(NamedTuple):
 
     @property
     def n_own(self) -> int:
-        """How many terms the family has."""
+        """Number of terms of the family."""
         return 0 if self.family is None else len(self.family.parameters)
 
     @property
     def without(self) -> int:
-        """Smooth functions that are left out: a family has a constant of its own."""
+        """Number of smooth functions left out: a family has its own constant."""
         return int(self.family is not None)
 
     @property
     def n_functions(self) -> int:
-        """How many terms there are."""
+        """Number of terms."""
         return self.n_own + self.smooth * (self.basis.n_functions - self.without)
 
     @property
     def units(self) -> Float[np.ndarray, " term"]:
-        """Of the coefficients: the curve's, and 1 for numbers of a family."""
+        """Units of the coefficients: the curve's, and 1 for dimensionless ones of a family."""
         units = np.full(self.n_functions, self.unit)
         units[: self.n_own][~self._is_value] = 1.0
         return units
 
     @property
     def scaled(self) -> Bool[np.ndarray, " term"]:
-        """Which of them grow with the modal mass: all but numbers of a family."""
+        """Which coefficients scale with the modal mass: all but a family's dimensionless ones."""
         scaled = np.ones(self.n_functions, dtype=bool)
         scaled[: self.n_own] = self._is_value
         return scaled
@@ -65,7 +65,7 @@ class CurveTerms(NamedTuple):
 
     @property
     def flat(self) -> Bool[np.ndarray, " term"]:
-        """Which have no prior: a family's, unless it says what one is near zero by."""
+        """Which coefficients have a flat prior: a family's, where it states no 1σ."""
         flat = np.zeros(self.n_functions, dtype=bool)
         if self.family is not None:
             flat[: self.n_own] = ~np.isfinite(self.family.expected_std())
@@ -78,17 +78,19 @@ class CurveTerms(NamedTuple):
     def curve(
         self, amplitude: Float[np.ndarray, " point"], coefficients: Float[np.ndarray, " term"]
     ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
-        """Values at its own amplitudes, and derivatives by their logarithm."""
+        """Values at amplitudes of the curve's argument, and derivatives by their logarithm."""
         if self.family is None:
-            return tuple(one[0] for one in self._drawn(amplitude, coefficients))
+            return tuple(one[0] for one in self._smooth_curves(amplitude, coefficients))
         own = self.family.linearised(amplitude, (self.units * coefficients)[: self.n_own])
         value, slope = own.value, amplitude * own.by_amplitude
         if self.smooth:
-            (left,), (steep,) = self._drawn(amplitude, np.append(0.0, coefficients[self.n_own :]))
-            value, slope = value + left, slope + steep
+            (rest,), (rest_slope,) = self._smooth_curves(
+                amplitude, np.append(0.0, coefficients[self.n_own :])
+            )
+            value, slope = value + rest, slope + rest_slope
         return value, slope
 
-    def _drawn(self, amplitude: np.ndarray, coefficients: np.ndarray) -> tuple:
+    def _smooth_curves(self, amplitude: np.ndarray, coefficients: np.ndarray) -> tuple:
         return self.basis.curves(amplitude, self.unit * coefficients[:, None])
 
     def columns(
@@ -106,7 +108,7 @@ class CurveTerms(NamedTuple):
     def at_rest(
         self, coefficients: Float[np.ndarray, " term"]
     ) -> tuple[float, Float[np.ndarray, " term"]]:
-        """Value and columns in the limit of no motion, zero where there is none (dry friction)."""
+        """Value and columns in the limit of zero amplitude; 0 where it diverges (dry friction)."""
         if self.family is None:
             columns = self.unit * self.basis.at_rest
             return float(columns @ coefficients), columns
@@ -116,13 +118,13 @@ class CurveTerms(NamedTuple):
         return float(value[0]), self.columns(np.zeros(1), coefficients)[0]
 
     def log_variances(self) -> tuple[Float[np.ndarray, " term"], Float[np.ndarray, "term hyper"]]:
-        """ln of the prior variances for smooth functions of size one (`CurveBasis`), and what they
-        gain by ln of the size, and by how it changes.
+        """ln of the prior variances for roughness of 1σ = 1 (`CurveBasis`), and their slopes by ln
+        of that 1σ and by its variation along the curve.
         """
         constant, slopes = self.basis.log_variances()
         if self.family is None:
             return constant, slopes
-        if self.smooth:  # the straight line is as large as what bends reach
+        if self.smooth:  # the line has the prior 1σ that the roughness adds up to
             constant[1] = 2 * np.log(self.basis.reach)
             slopes[1, 0] = 2.0
         std = self.family.expected_std()

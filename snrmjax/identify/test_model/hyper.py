@@ -1,8 +1,8 @@
-"""The hyperparameters of a test, and where its unknowns stand: sizes of noise, levels, curves.
+"""Hyperparameters of a test (1σ of noise, level errors, roughness), and the layout of its unknowns.
 
-Curves that bend and levels that differ often explain a test alike: the sizes of the bends are then
-known to a factor of ten only, and the most likely ones say nothing of what curves the others give.
-`averaged` weighs them.
+Rough curves and differing levels often explain a test equally well: the 1σ of the roughness is then
+known to a factor of ten only, and its most likely value alone gives too narrow bands. `averaged`
+averages over a grid of it.
 Reference: for a grid of hyperparameters about their mode, Rue, Martino & Chopin, J. R. Stat. Soc. B
 71 (2009) 319, section 3.1, doi:10.1111/j.1467-9868.2008.00700.x.
 """
@@ -24,33 +24,33 @@ from snrmjax.identify.test_model.linear_gaussian import (
 )
 from snrmjax.identify.test_model.states import TestStates
 
-_STRAIGHT = 1e-4  # size of bends, below which no test sees them
-_SMALLEST_SIZE = 1e-4  # over a prior's scale, that a size is at least
-_FARTHEST = 5.0  # 1σ, of a change of the bends' size
-_MOST = 0.5  # 1σ of a level's error, relative or rad: beyond it levels are not one structure's
-_LEAST = 4.0  # nats below the likeliest, from which on sizes are left out
-ALONG = 14  # functions of phase and amplitude of a discrepancy, for each part
+_STRAIGHT = 1e-4  # 1σ of the roughness: no test resolves less
+_SMALLEST_STD = 1e-4  # of a prior's scale: lower bound of a 1σ
+_FARTHEST = 5.0  # 1σ: bound of the variation of the roughness
+_MOST = 0.5  # upper bound of 1σ of level errors, relative or rad: more is another structure
+_LEAST = 4.0  # nats below the most likely grid point: points below are not expanded
+ALONG = 14  # basis functions of a discrepancy, for each of the two parts
 
 
-# Where the unknowns stand that all states share: the last two are the exponents of frequency.
+# Indices of the unknowns that all states share; the last two are the frequency exponents.
 MASS, PHASE, OFFSET, TREND, WITH_FREQUENCY = 0, 1, 2, 3, slice(4, 6)
 
 
 class Hyper(NamedTuple):
-    """The hyperparameters, by what they are of."""
+    """The hyperparameters of a test."""
 
-    noise: float  # over the stated one, or relative where none is
-    roughness: tuple[float, float]  # size of both curves' bends, over the curves' units
+    noise: float  # over the stated noise, or relative where none is stated
+    roughness: tuple[float, float]  # 1σ of both curves' roughness, in the curves' units
     level_std: tuple[float, float, float, float]  # of `LEVEL_ERRORS`
-    along: Float[np.ndarray, " direction"]  # how the logarithm of the bends' size changes
-    discrepancy: tuple[float, float]  # of both parts, over Ωδ
+    along: Float[np.ndarray, " direction"]  # variation of the log of that 1σ along the curve
+    discrepancy: tuple[float, float]  # 1σ of both parts, over Ωδ
 
 
-class Places(NamedTuple):
-    """Where the unknowns stand, and the squared frequency that stiffness is counted from.
+class Layout(NamedTuple):
+    """Indices of the unknowns, and the squared frequency that stiffness is relative to.
 
-    The modal mass comes first, then the instruments' phase, the offset of the force, a trend of
-    the stiffness, and how both curves go with the forcing frequency.
+    First the modal mass, the instruments' phase, the force offset, the trend of the stiffness, and
+    the exponents of both curves in the forcing frequency.
     """
 
     stiffness: slice
@@ -61,7 +61,7 @@ class Places(NamedTuple):
     others: slice  # linear parameters of the other modes, in their own 1σ
 
     @property
-    def beside(self) -> slice:
+    def both_discrepancies(self) -> slice:
         """Both parts of a discrepancy."""
         return slice(self.discrepancy[0].start, self.discrepancy[1].stop)
 
@@ -69,10 +69,10 @@ class Places(NamedTuple):
 Pair = tuple[CurveTerms, CurveTerms]
 
 
-def places_of(
+def layout_of(
     terms: Pair, n_levels: int, discrepancy: bool, reference: float, n_others: int = 0
-) -> Places:
-    """The places for so many levels and parameters of others, with or without a discrepancy."""
+) -> Layout:
+    """The layout for these numbers of levels and of parameters of other modes."""
     start = WITH_FREQUENCY.stop
     middle = start + terms[0].n_functions
     first = middle + terms[1].n_functions
@@ -80,21 +80,21 @@ def places_of(
     end, wide = first + 4 * n_levels, ALONG * discrepancy
     two = slice(end, end + wide), slice(end + wide, end + 2 * wide)
     others = slice(end + 2 * wide, end + 2 * wide + n_others)
-    return Places(slice(start, middle), slice(middle, first), levels, two, reference, others)
+    return Layout(slice(start, middle), slice(middle, first), levels, two, reference, others)
 
 
-# In the order of a point of hyperparameters: noise, bends of two curves, four errors of levels,
-# change of the bends' size along the curves, and two discrepancies where there are any.
+# Order of a vector of hyperparameters, all logarithms of 1σ: noise, roughness of both curves, four
+# level errors, variation of the roughness along the curves, and two discrepancies where present.
 NOISE, ROUGHNESS, LEVELS, FIRST_ALONG = 0, slice(1, 3), slice(3, 7), 7
 
 
 def end_of_along(terms: Pair) -> int:
-    """Where in a point the numbers end that say how the bends' size changes."""
+    """End of the entries for the variation of the roughness."""
     return FIRST_ALONG + terms[0].basis.directions.shape[1]
 
 
 def hyper_at(point: np.ndarray, terms: Pair) -> Hyper:
-    """The hyperparameters of a point: logarithms of sizes, and how those of bends change."""
+    """The hyperparameters of a vector of their logarithms."""
     end = end_of_along(terms)
     noise, first, second, *levels = np.exp(point[:FIRST_ALONG]).tolist()
     more = np.exp(point[end:]).tolist() or (0.0, 0.0)
@@ -108,71 +108,71 @@ def hyper_at(point: np.ndarray, terms: Pair) -> Hyper:
 
 
 def point_of(hyper: Hyper) -> np.ndarray:
-    """The point of these hyperparameters, without a discrepancy."""
-    sizes = np.log([hyper.noise, *hyper.roughness, *hyper.level_std])
-    return np.concatenate([sizes, hyper.along])
+    """The vector of these hyperparameters, without a discrepancy."""
+    log_stds = np.log([hyper.noise, *hyper.roughness, *hyper.level_std])
+    return np.concatenate([log_stds, hyper.along])
 
 
 def starting_point(states: TestStates, terms: Pair, discrepancy: bool) -> np.ndarray:
-    """The point from which the most likely one is looked for."""
+    """Starting point of the maximisation."""
     noise = priors.STATED_NOISE if states.stated else priors.UNSTATED_NOISE
     levels = [
         std if std > 0 else 0.3 * prior.scale
         for std, prior in zip(states.level_std, priors.LEVELS, strict=True)
     ]
     more = [0.3 * priors.DISCREPANCY.scale] * (2 * discrepancy)
-    sizes = np.log([noise.median, *[priors.CURVE_ROUGHNESS.median] * 2, *levels])
-    return np.concatenate([sizes, np.zeros(end_of_along(terms) - FIRST_ALONG), np.log(more)])
+    log_stds = np.log([noise.median, *[priors.CURVE_ROUGHNESS.median] * 2, *levels])
+    return np.concatenate([log_stds, np.zeros(end_of_along(terms) - FIRST_ALONG), np.log(more)])
 
 
 def bounds_of(states: TestStates, terms: Pair, point: np.ndarray) -> list[tuple[float, float]]:
-    """Between which points lie; what is stated is held, and so is the size of no bends."""
+    """Bounds of the hyperparameters: stated ones are fixed, and so is the roughness of none."""
     low = np.log(_STRAIGHT)
-    sizes = [(np.log(1e-7), np.log(2.0)) if one.smooth else (low, low) for one in terms]
+    roughness = [(np.log(1e-7), np.log(2.0)) if one.smooth else (low, low) for one in terms]
     noise = (np.log(0.02), np.log(1e6)) if states.stated else (np.log(1e-5), np.log(1.0))
     levels = []
     for stated, prior in zip(states.level_std, priors.LEVELS, strict=True):
-        held = np.log(stated) if stated > 0 else None
-        wide = (np.log(_SMALLEST_SIZE * prior.scale), np.log(_MOST))
-        levels.append(wide if held is None else (held, held))
+        fixed = np.log(stated) if stated > 0 else None
+        wide = (np.log(_SMALLEST_STD * prior.scale), np.log(_MOST))
+        levels.append(wide if fixed is None else (fixed, fixed))
     n = end_of_along(terms) - FIRST_ALONG
-    left = len(point) - FIRST_ALONG - n
-    more = [(np.log(_SMALLEST_SIZE * priors.DISCREPANCY.scale), 0.0)] * left
-    return [noise, *sizes, *levels, *[(-_FARTHEST, _FARTHEST)] * n, *more]
+    n_more = len(point) - FIRST_ALONG - n
+    more = [(np.log(_SMALLEST_STD * priors.DISCREPANCY.scale), 0.0)] * n_more
+    return [noise, *roughness, *levels, *[(-_FARTHEST, _FARTHEST)] * n, *more]
 
 
 class PriorVariances(NamedTuple):
-    """Prior variances of all unknowns: their logarithms are linear in a point of hyperparameters.
+    """Prior variances of all unknowns; their logarithms are linear in the hyperparameters.
 
-    What is held at zero has −∞.
+    An unknown fixed at zero has −∞.
     """
 
     constant: Float[np.ndarray, " unknown"]
     slopes: Float[np.ndarray, "unknown hyper"]
 
     def __call__(self, point: Float[np.ndarray, " hyper"]) -> Float[np.ndarray, " unknown"]:
-        """The variances at a point."""
+        """The variances at these hyperparameters."""
         return np.exp(self.constant + self.slopes @ point)
 
 
-def prior_variances(terms: Pair, places: Places, states: TestStates) -> PriorVariances:
-    """Those of a test's unknowns."""
-    n, end = places.others.stop, end_of_along(terms)
-    with_more = places.discrepancy[0].stop > places.discrepancy[0].start
-    constant, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
-    held = (states.mass_std, states.phase_std, states.offset_std, states.trend_std)
+def prior_variances(terms: Pair, layout: Layout, states: TestStates) -> PriorVariances:
+    """Prior variances of a test's unknowns."""
+    n, end = layout.others.stop, end_of_along(terms)
+    has_discrepancy = layout.discrepancy[0].stop > layout.discrepancy[0].start
+    constant, slopes = np.zeros(n), np.zeros((n, end + 2 * has_discrepancy))
+    stds = (states.mass_std, states.phase_std, states.offset_std, states.trend_std)
     with np.errstate(divide="ignore"):
-        constant[: WITH_FREQUENCY.stop] = 2 * np.log([*held, *states.off_resonance_std])
-    for k, functions in enumerate((places.stiffness, places.damping)):
+        constant[: WITH_FREQUENCY.stop] = 2 * np.log([*stds, *states.off_resonance_std])
+    for k, functions in enumerate((layout.stiffness, layout.damping)):
         constant[functions], by = terms[k].log_variances()
         slopes[functions, ROUGHNESS.start + k], slopes[functions, FIRST_ALONG:end] = (
             by[:, 0],
             by[:, 1:],
         )
     for k in range(4):
-        slopes[places.levels[:, k], LEVELS.start + k] = 2.0
-    for k in range(2 * with_more):
-        slopes[places.discrepancy[k], end + k] = 2.0
+        slopes[layout.levels[:, k], LEVELS.start + k] = 2.0
+    for k in range(2 * has_discrepancy):
+        slopes[layout.discrepancy[k], end + k] = 2.0
     return PriorVariances(constant, slopes)
 
 
@@ -180,16 +180,16 @@ def objective_of(
     equations: LinearRows,
     states: TestStates,
     terms: Pair,
-    places: Places,
+    layout: Layout,
     *,
     flat: bool = False,
-    drawn: tuple[bool, bool] = (True, True),
+    free_roughness: tuple[bool, bool] = (True, True),
 ) -> Objective:
-    """Likelihood times prior; with `flat` that of levels' errors alone is left out, and that of
-    bends that are not `drawn`.
+    """Log of likelihood times prior; with `flat` without the priors of level errors, and without
+    the roughness prior of curves that are not `free_roughness`.
     """
     noise = priors.STATED_NOISE if states.stated else priors.UNSTATED_NOISE
-    variances = prior_variances(terms, places, states)
+    variances = prior_variances(terms, layout, states)
     n = variances.slopes.shape[1]
     of_levels = [
         None if stated > 0 or flat else prior
@@ -198,7 +198,7 @@ def objective_of(
     along = [priors.ROUGHNESS_VARIES] * (end_of_along(terms) - FIRST_ALONG)
     roughness = [
         priors.CURVE_ROUGHNESS if one.smooth and kept else None
-        for one, kept in zip(terms, drawn, strict=True)
+        for one, kept in zip(terms, free_roughness, strict=True)
     ]
     densities = [noise, *roughness, *of_levels, *along, *[priors.DISCREPANCY] * 2]
     prior = priors.JointDensity.of(densities[:n])
@@ -216,51 +216,51 @@ def objective_of(
 
 
 class Gaussian(NamedTuple):
-    """What is said of the unknowns."""
+    """Gaussian posterior of the unknowns."""
 
     mean: Float[np.ndarray, " unknown"]
     covariance: Float[np.ndarray, "unknown unknown"]
-    told: float  # how many unknowns the states, and not their priors, tell
-    level_std: Float[np.ndarray, " error"]  # 1σ of levels' errors that the covariance has
+    effective_unknowns: float  # number that the states, not the priors, determine
+    level_std: Float[np.ndarray, " error"]  # 1σ of level errors in the covariance
 
 
-class SizedPoint(NamedTuple):
-    """Hyperparameters, likeliest for some sizes of the bends."""
+class GridPoint(NamedTuple):
+    """Most likely hyperparameters for fixed roughness of both curves."""
 
-    log_evidence: float  # integrated over the others
+    log_evidence: float  # integrated over the other hyperparameters
     point: Float[np.ndarray, " hyper"]
 
 
-def roughness_stds(
+def roughness_grid(
     objective: Objective,
-    likeliest: Float[np.ndarray, " hyper"],
+    mode: Float[np.ndarray, " hyper"],
     bounds: list[tuple[float, float]],
-) -> list[SizedPoint]:
-    """The points of a grid about the likeliest: from neighbour to neighbour, while they count."""
+) -> list[GridPoint]:
+    """Points of a grid of roughness about the most likely, expanded while the evidence counts."""
     step, low = priors.CURVE_ROUGHNESS.spread, np.log(_STRAIGHT)
-    middle, high = np.maximum(likeliest[ROUGHNESS], low), np.transpose(bounds[ROUGHNESS])[1]
-    sized: dict[tuple[int, int], SizedPoint] = {}
-    queue = [((0, 0), likeliest)]
+    middle, high = np.maximum(mode[ROUGHNESS], low), np.transpose(bounds[ROUGHNESS])[1]
+    grid: dict[tuple[int, int], GridPoint] = {}
+    queue = [((0, 0), mode)]
     while queue:
         (a, b), start = queue.pop(0)
-        sizes = middle + step * np.array([a, b])
-        if (a, b) in sized or np.any((sizes < low - step / 2) | (sizes > high)):
+        log_stds = middle + step * np.array([a, b])
+        if (a, b) in grid or np.any((log_stds < low - step / 2) | (log_stds > high)):
             continue
-        held, start = list(bounds), start.copy()
-        start[ROUGHNESS] = np.maximum(sizes, low)
-        held[ROUGHNESS] = [(size, size) for size in start[ROUGHNESS]]
-        point = maximised(objective, start, held)
-        here = SizedPoint(laplace_evidence(objective, point, held), point)
-        sized[a, b] = here
-        if here.log_evidence > max(other.log_evidence for other in sized.values()) - _LEAST:
+        fixed, start = list(bounds), start.copy()
+        start[ROUGHNESS] = np.maximum(log_stds, low)
+        fixed[ROUGHNESS] = [(value, value) for value in start[ROUGHNESS]]
+        point = maximised(objective, start, fixed)
+        here = GridPoint(laplace_evidence(objective, point, fixed), point)
+        grid[a, b] = here
+        if here.log_evidence > max(other.log_evidence for other in grid.values()) - _LEAST:
             queue += [((a + i, b + j), point) for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    return list(sized.values())
+    return list(grid.values())
 
 
 def averaged(
-    points: list[SizedPoint], posterior: Callable[[np.ndarray], Gaussian]
+    points: list[GridPoint], posterior: Callable[[np.ndarray], Gaussian]
 ) -> tuple[Float[np.ndarray, " hyper"], Gaussian]:
-    """The mean of the points, and mean and covariance of what each says of the unknowns."""
+    """The mean hyperparameters, and mean and covariance of the mixture of posteriors."""
     weight = np.array([point.log_evidence for point in points])
     weight = np.exp(weight - weight.max())
     weight = weight / weight.sum()
@@ -268,22 +268,24 @@ def averaged(
     means = np.array([one.mean for one in each])
     mean = weight @ means
     within = np.einsum("k,kij->ij", weight, np.array([one.covariance for one in each]))
-    off = means - mean
+    offset = means - mean
     point = weight @ np.array([point.point for point in points])
-    effective = float(weight @ np.array([one.told for one in each]))
+    effective = float(weight @ np.array([one.effective_unknowns for one in each]))
     level_std = weight @ np.array([one.level_std for one in each])
-    return point, Gaussian(mean, within + (off * weight[:, None]).T @ off, effective, level_std)
+    return point, Gaussian(
+        mean, within + (offset * weight[:, None]).T @ offset, effective, level_std
+    )
 
 
 def remainders(
     equations: LinearRows,
     states: TestStates,
     terms: Pair,
-    places: Places,
+    layout: Layout,
     point: Float[np.ndarray, " hyper"],
 ) -> tuple[bool, bool]:
-    """Which families leave a remainder that noise does not explain: where none has a probability
-    below `priors.REMAINDER_BY_CHANCE`, whatever the other curve has.
+    """Which families leave a remainder that noise does not explain: where "no remainder" has a
+    probability below `priors.REMAINDER_BY_CHANCE`, summed over both cases of the other curve.
     """
     named = [one.family is not None and one.smooth for one in terms]
     if not any(named):
@@ -291,18 +293,21 @@ def remainders(
     log_odds = np.log(1 / priors.NO_REMAINDER - 1)
     weights: dict[tuple[bool, bool], float] = {}
     either = [(False, True) if own else (True,) for own in named]
-    for drawn in itertools.product(either[0], either[1]):
+    for free_roughness in itertools.product(either[0], either[1]):
         bounds = bounds_of(states, terms, point)
-        for k, kept in enumerate(drawn):
+        for k, kept in enumerate(free_roughness):
             if not kept:
                 bounds[ROUGHNESS.start + k] = (bounds[ROUGHNESS.start + k][0],) * 2
-        objective = objective_of(equations, states, terms, places, drawn=drawn)
+        objective = objective_of(equations, states, terms, layout, free_roughness=free_roughness)
         best = maximised(objective, point, bounds)
-        weights[drawn] = laplace_evidence(objective, best, bounds) + log_odds * sum(drawn)
+        weights[free_roughness] = laplace_evidence(objective, best, bounds) + log_odds * sum(
+            free_roughness
+        )
     total = np.logaddexp.reduce(list(weights.values()))
     first, second = (
         np.logaddexp.reduce(
-            [weight for drawn, weight in weights.items() if not drawn[k]] or -np.inf
+            [weight for free_roughness, weight in weights.items() if not free_roughness[k]]
+            or -np.inf
         )
         - total
         < np.log(priors.REMAINDER_BY_CHANCE)
@@ -314,7 +319,7 @@ def remainders(
 def differing_levels(
     objective: Objective, point: np.ndarray, bounds: list[tuple[float, float]], states: TestStates
 ) -> tuple[bool, bool, bool, bool]:
-    """Which unstated errors of levels the likelihood asks for: the others are left out in turn."""
+    """Which unstated level errors the likelihood supports, by backward elimination."""
     kept = [k for k, std in enumerate(states.level_std) if not std > 0]
     if states.n_levels < 2:
         kept = []
@@ -323,12 +328,12 @@ def differing_levels(
     while kept:
         trials = []
         for kind in kept:
-            held = list(bounds)
+            fixed = list(bounds)
             for k in range(4):
                 if not states.level_std[k] > 0 and (k == kind or k not in kept):
                     low = bounds[LEVELS.start + k][0]
-                    held[LEVELS.start + k] = (low, low)
-            without = maximised(objective, point, held)
+                    fixed[LEVELS.start + k] = (low, low)
+            without = maximised(objective, point, fixed)
             trials.append((objective(without)[0], kind, without))
         least, kind, without = max(trials, key=lambda trial: trial[0])
         if value - least > 0.5 * priors.LEVELS_DIFFER:

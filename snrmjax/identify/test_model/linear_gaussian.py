@@ -1,7 +1,7 @@
-"""A linear Gaussian model, marginalised: its likelihood by noise and prior variances, with slopes.
+"""A linear Gaussian model: marginal likelihood of noise and prior variances, with its gradient.
 
-Rows r = H x + e with x ~ N(0, diag v) and e ~ N(0, s²). H is made triangular once, however many
-rows there are, and each evaluation factors a matrix of the size of the unknowns.
+Rows r = H x + e with x ~ N(0, diag v) and e ~ N(0, s²). H is reduced to triangular form once; each
+evaluation then factors a matrix of the size of the unknowns.
 """
 
 from collections.abc import Callable
@@ -13,27 +13,25 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.optimize import minimize
 
-_STEP = 1e-4  # of a logarithm, for second derivatives
-_ROUNDING = 1e-12  # of the diagonal: rounding must not make a matrix singular
-_STEPS = 60  # of the search for the most likely hyperparameters, at most
+_STEP = 1e-4  # of a logarithm, for finite differences of the gradient
+_ROUNDING = 1e-12  # of the diagonal: keeps a matrix regular in floating point
+_STEPS = 60  # L-BFGS iterations at most
 
 
 class LinearRows(NamedTuple):
-    """Rows of unit variance where the noise is as stated, as far as a likelihood sees them.
+    """Sufficient statistics of rows that have unit variance where the noise is as stated.
 
-    By H = QR: c = Qᵀr, and what no unknowns explain. Nothing is then a difference of large numbers,
-    however wide the priors and small the noise.
+    From H = QR: c = Qᵀr, and the residual |r − Qc|². No cancellation then, however wide the priors
+    and small the noise.
     """
 
     triangle: Float[np.ndarray, "direction unknown"]  # R
     along: Float[np.ndarray, " direction"]  # c
     across: float  # |r − Qc|²
     n_rows: int
-    offset: float = 0.0  # ln of the Jacobian from the rows to what was recorded
-    fraction: float = (
-        1.0  # of the rows that tell something of their own: a power of their likelihood
-    )
-    n_flat: int = 0  # directions, the first, that unknowns without a prior take
+    offset: float = 0.0  # ln of the Jacobian from the rows to the record
+    fraction: float = 1.0  # effective fraction of independent rows: power of the likelihood
+    n_flat: int = 0  # leading directions, taken by unknowns with a flat prior
 
     @classmethod
     def of(
@@ -43,19 +41,19 @@ class LinearRows(NamedTuple):
         offset: float = 0.0,
         flat: Bool[np.ndarray, " unknown"] | None = None,
     ) -> "LinearRows":
-        """Of a design H and rows r.
+        """Of a design matrix H and rows r.
 
-        Unknowns that are `flat` have no prior: the likelihood is that of what they leave of the
-        rows (restricted likelihood), whatever their variances are.
+        For unknowns with a `flat` prior the likelihood is the restricted one (REML): that of the
+        rows' component they cannot fit, whatever their variances.
         """
         flat = np.zeros(design.shape[1], dtype=bool) if flat is None else flat
         order = np.argsort(~flat, kind="stable")
         directions, triangle = np.linalg.qr(design[:, order])
         along = directions.T @ rows
-        left = rows - directions @ along
+        residual = rows - directions @ along
         whole = np.empty_like(triangle)
         whole[:, order] = triangle
-        square, n_flat = float(left @ left), min(int(flat.sum()), len(along))
+        square, n_flat = float(residual @ residual), min(int(flat.sum()), len(along))
         return cls(whole, along, square, len(rows), offset, n_flat=n_flat)
 
     def posterior(
@@ -63,8 +61,8 @@ class LinearRows(NamedTuple):
     ) -> tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, "unknown unknown"]]:
         """Mean and covariance of the unknowns.
 
-        By orthogonal factors of rows and priors: what several unknowns do alike, of which wide and
-        narrow priors say how they share it, would drown in the rounding of normal equations.
+        By QR of rows and priors stacked: nearly collinear unknowns with priors of very different
+        width would be lost to rounding in the normal equations.
         """
         scale, root = scale / np.sqrt(self.fraction), np.sqrt(variance)
         stacked = np.vstack([self.triangle * (root / scale), np.eye(len(root))])
@@ -77,7 +75,7 @@ class LinearRows(NamedTuple):
     def log_likelihood(
         self, scale: float, variance: Float[np.ndarray, " unknown"]
     ) -> tuple[float, float, Float[np.ndarray, " unknown"]]:
-        """ln p of the rows, and its slopes by ln s and by the logarithms of the variances."""
+        """ln p of the rows, and its derivatives by ln s and by the logarithms of the variances."""
         by_root = self.triangle[self.n_flat :] * np.sqrt(variance)
         n, m = self.fraction * (self.n_rows - self.n_flat), len(by_root)
         constant = n * np.log(2 * np.pi * scale**2)
@@ -87,7 +85,7 @@ class LinearRows(NamedTuple):
         scale = scale / np.sqrt(self.fraction)
         covariance = by_root @ by_root.T
         covariance[np.diag_indices(m)] += scale**2
-        # In units that make it even.
+        # Scaled to a unit diagonal, for conditioning.
         unit = 1 / np.sqrt(np.diagonal(covariance))
         covariance *= unit[:, None] * unit
         covariance[np.diag_indices(m)] += _ROUNDING
@@ -101,7 +99,7 @@ class LinearRows(NamedTuple):
         sensitivities, along = both[:, :-1], both[:, -1]
         informed = np.einsum(
             "ij,ij->j", sensitivities, sensitivities
-        )  # of every unknown by the rows: m less noise's
+        )  # information of the rows on every unknown; sums to m less the noise's part
         weighed = dtrtrs(factor, along, lower=True, trans=1)[0] * unit
         log_det = 2 * float(np.sum(np.log(np.diagonal(factor) / unit)))
         square = float(along @ along) + self.across / scale**2
@@ -117,7 +115,7 @@ Objective = Callable[[Float[np.ndarray, " hyper"]], tuple[float, Float[np.ndarra
 def laplace_evidence(
     objective: Objective, point: Float[np.ndarray, " hyper"], bounds: list[tuple[float, float]]
 ) -> float:
-    """ln p integrated about its maximum, by Laplace's approximation, over what is not held."""
+    """ln p integrated about its maximum over what is not fixed, by Laplace's approximation."""
     free = np.array([high > low for low, high in bounds])
     precision = precision_at(objective, point)[np.ix_(free, free)]
     volume = 0.5 * (len(precision) * np.log(2 * np.pi) - np.linalg.slogdet(precision)[1])
@@ -127,7 +125,7 @@ def laplace_evidence(
 def precision_at(
     objective: Objective, point: Float[np.ndarray, " hyper"]
 ) -> Float[np.ndarray, "hyper hyper"]:
-    """Negative second derivatives of ln p, where it is flat or at a bound those of a wide prior."""
+    """Negative Hessian of ln p; flat directions get the precision of a wide prior (σ = 10)."""
     hessian = np.zeros((len(point), len(point)))
     for k, unit in enumerate(_STEP * np.eye(len(point))):
         hessian[k] = (objective(point - unit)[1] - objective(point + unit)[1]) / (2 * _STEP)

@@ -1,20 +1,20 @@
-"""One posterior of a test: both curves, the modal mass, levels, what is left, and the noise.
+"""Joint posterior of a test: both curves, modal mass, level errors, discrepancy, and noise.
 
-The closed form of the two equations of the method is linear in all that is unknown. Written for
-Z = FA/X of every state (`TestStates`), what can be wrong moves it to first order:
+The force balance is linear in all unknowns. For Z = FA/X of every state (`TestStates`), errors
+change its residual to first order:
 
-| error | residual Z − κ(K − Ω² + iΩδ) moves by |
+| error | change of the residual Z − κ(K − Ω² + iΩδ) |
 |---|---|
 | force, relative | Z |
-| velocity, relative | −Z − κ a (K′ + iΩδ′): a itself moves |
+| velocity, relative | −Z − κ a (K′ + iΩδ′), as a changes too |
 | phase | −iZ |
 | stiffness of a level, relative | −κK |
 | damping of a level, relative | −iΩκδ |
 
-Slopes and weights are those at the states corrected for their most likely errors, found in a few
-rounds (orthogonal distance regression). Given the hyperparameters (noise, sizes of levels' errors,
-of the curves' bends and of the discrepancy) all is one Gaussian (`linear_gaussian`); those are
-taken where likelihood times prior is largest, and integrated over by Laplace's approximation.
+It is linearised at the states corrected for their most likely errors, in Gauss–Newton iterations
+(orthogonal distance regression). Given the hyperparameters (1σ of noise, level errors, roughness
+and discrepancy) the posterior is Gaussian (`linear_gaussian`); the hyperparameters are at their
+posterior mode, and the evidence integrates over them by Laplace's approximation.
 """
 
 import functools
@@ -29,6 +29,7 @@ from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import CurveBasis
 from snrmjax.identify.test_model.curve_terms import CurveTerms
+from snrmjax.identify.test_model.gauss_newton import Iterate, Rounds, multistart
 from snrmjax.identify.test_model.hyper import (
     ALONG,
     MASS,
@@ -38,28 +39,27 @@ from snrmjax.identify.test_model.hyper import (
     TREND,
     Gaussian,
     Hyper,
-    Places,
+    Layout,
     averaged,
     bounds_of,
     differing_levels,
     hyper_at,
+    layout_of,
     objective_of,
-    places_of,
     prior_variances,
     remainders,
-    roughness_stds,
+    roughness_grid,
 )
 from snrmjax.identify.test_model.linear_gaussian import laplace_evidence
 from snrmjax.identify.test_model.state_noise import StateNoise, noise_of_states
 from snrmjax.identify.test_model.states import RECORDED, TestStates
-from snrmjax.identify.test_model.walk import Reached, Rounds, likeliest_walk
 from snrmjax.numerics.blocks import on_one_core
 
 _ALL = Rounds()
-_NOISE_ROUNDS = 3  # of finding what noise is made of, at most
-_SAME_NOISE = 0.1  # relative, by which its parts then move
-_LITTLE_MORE = 2.0  # times: phases that were not controlled spread far more than by scatter
-_REACH = 3.0  # times the dynamic stiffness, that a natural frequency may lie beside a test
+_NOISE_ROUNDS = 3  # of estimating the noise components, at most
+_SAME_NOISE = 0.1  # relative convergence tolerance of the components
+_LITTLE_MORE = 2.0  # ratio of phase spread to frequency scatter: more is not phase control
+_REACH = 3.0  # dynamic stiffnesses that ω̃² may lie outside the tested range of Ω²
 
 
 class CurveValues(NamedTuple):
@@ -72,7 +72,7 @@ class CurveValues(NamedTuple):
 
 
 class TestPosterior(NamedTuple):
-    """What the states say together; `fit_test` makes it."""
+    """Posterior of all states together, by `fit_test`."""
 
     states: TestStates
     terms: tuple[CurveTerms, CurveTerms]  # of ω̃² and δ
@@ -81,39 +81,39 @@ class TestPosterior(NamedTuple):
     hyper: Hyper
     log_evidence: float
     log_likelihood: float  # of the states alone, at the most likely unknowns
-    corrections: Float[np.ndarray, "state input"]  # most likely errors, subtracted from the record
-    residuals: Float[np.ndarray, "state part"]  # whitened: of unit variance where all is right
-    effective_unknowns: float  # that the states, and not their priors, tell
-    places: Places
-    differing: tuple[bool, bool, bool, bool]  # whether levels differ by more than is stated
+    corrections: Float[np.ndarray, "state input"]  # most likely errors, added to the record
+    residuals: Float[np.ndarray, "state part"]  # whitened: unit variance if the model holds
+    effective_unknowns: float  # number that the states, not the priors, determine
+    layout: Layout
+    differing: tuple[bool, bool, bool, bool]  # by more than stated, of `LEVEL_ERRORS`
     weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
-    fraction: float  # of the states that count, where neighbours err alike
-    settled: bool  # whether the last round moved nothing by more than its error
-    in_order: tuple[bool, ...]  # which errors of levels run with their forces: curves do
-    remainders: tuple[bool, bool]  # whether noise does not explain what a family leaves
-    level_std: Float[np.ndarray, " error"]  # 1σ of levels' errors as the covariance has them
+    fraction: float  # independent fraction of the states, for correlated residuals
+    converged: bool  # whether the last iteration was below tolerance
+    in_order: tuple[bool, ...]  # which level errors correlate with force
+    remainders: tuple[bool, bool]  # whether a family leaves more than noise
+    level_std: Float[np.ndarray, " error"]  # 1σ of level errors in the covariance
 
     @property
     def frequency_scatter(self) -> float:
-        """1σ by which the natural frequency scatters from state to state, relative.
+        """Relative 1σ of the natural frequency's scatter from state to state.
 
-        Zero where the noise of force and velocity explains the scatter.
+        Zero where the noise of force and velocity explains the residuals.
         """
         stiffness = self.states.errors[:, RECORDED:].sum(axis=1)
         return 0.5 * self.hyper.noise * float(np.max(stiffness, initial=0.0))
 
     @property
     def phase_is_controlled(self) -> bool:
-        """Whether phases spread little more than scatter of the natural frequency would make them.
+        """Whether the phases spread little more than the natural frequency's scatter implies.
 
         The phase was then controlled, and the states do not determine the modal mass: a small mass
-        with a wide resonance would explain the small spread.
+        with a broad resonance would explain the small spread as well.
         """
         if self.states.of_one_phase:
             return True
         bandwidth = np.median(np.abs(self.curves(self.states.amplitude).modal_damping))
-        turned = 2 * self.frequency_scatter * float(np.median(self.states.frequency) / bandwidth)
-        return _LITTLE_MORE * turned > float(np.std(self.states.phase))
+        phase_std = 2 * self.frequency_scatter * float(np.median(self.states.frequency) / bandwidth)
+        return _LITTLE_MORE * phase_std > float(np.std(self.states.phase))
 
     @property
     def modal_mass(self) -> tuple[float, float]:
@@ -122,68 +122,68 @@ class TestPosterior(NamedTuple):
 
     @property
     def instrument_phase(self) -> float:
-        """Phase that all records share, rad."""
+        """Phase error common to all records, rad."""
         return float(self.mean[PHASE])
 
     @property
     def force_offset(self) -> float:
-        """Offset of the force, over the smallest."""
+        """Force offset, relative to the smallest force."""
         return float(self.mean[OFFSET])
 
     @property
     def trend(self) -> tuple[float, float]:
-        """Relative change of the stiffness per unit of the states' trend, and its 1σ."""
+        """Relative stiffness change per unit of the states' trend, and its 1σ."""
         return float(self.mean[TREND]), float(np.sqrt(self.covariance[TREND, TREND]))
 
     @property
     def level_errors(self) -> Float[np.ndarray, "level error"]:
-        """Most likely errors of every level: gain and phase (rad) of its record, and relative
-        deviations of stiffness and damping.
+        """Most likely errors of every level: gain, phase (rad), and relative deviations of
+        stiffness and damping.
         """
-        return self.mean[self.places.levels]
+        return self.mean[self.layout.levels]
 
     def beginning(
         self,
         parent: Int[np.ndarray, " level"] | None = None,
         terms: tuple[CurveTerms, CurveTerms] | None = None,
     ) -> "TestPosterior":
-        """Where a fit begins of the same states in other levels, each a part of a `parent` of
-        these, or by other terms: from a family as it is, and from smooth functions near these.
+        """Starting point for the same states with levels split (`parent` of each new one), or with
+        other curve terms: a family starts as given, smooth curves near the current ones.
         """
-        parent = np.arange(len(self.places.levels)) if parent is None else parent
+        parent = np.arange(len(self.layout.levels)) if parent is None else parent
         terms = self.terms if terms is None else terms
-        n_others = self.places.others.stop - self.places.others.start
-        reference = 0.0 if terms[0].family is not None else self.places.reference
-        places = places_of(terms, len(parent), False, reference, n_others)
-        mean, own = np.zeros(places.others.stop), self.places
-        mean[: places.stiffness.start] = self.mean[: places.stiffness.start]
-        mean[places.others], mean[places.levels] = self.mean[own.others], self.level_errors[parent]
+        n_others = self.layout.others.stop - self.layout.others.start
+        reference = 0.0 if terms[0].family is not None else self.layout.reference
+        layout = layout_of(terms, len(parent), False, reference, n_others)
+        mean, own = np.zeros(layout.others.stop), self.layout
+        mean[: layout.stiffness.start] = self.mean[: layout.stiffness.start]
+        mean[layout.others], mean[layout.levels] = self.mean[own.others], self.level_errors[parent]
         was = (own.stiffness, own.damping)
         for k, (now, functions) in enumerate(
-            zip(terms, (places.stiffness, places.damping), strict=True)
+            zip(terms, (layout.stiffness, layout.damping), strict=True)
         ):
             if now.n_functions == self.terms[k].n_functions and now.family is None:
                 mean[functions] = self.mean[was[k]]
             elif now.family is not None:
-                # A family that goes on without its remainder, or is new to the states.
+                # A family resumed without its remainder, or a new one.
                 start = now.family.parameters / now.units[: now.n_own]
                 scaled = np.where(now.scaled[: now.n_own], self.modal_mass[0], 1.0) * start
                 mean[functions.start : functions.start + now.n_own] = scaled
-        return self._replace(mean=mean, places=places, terms=terms)
+        return self._replace(mean=mean, layout=layout, terms=terms)
 
     def curves(self, amplitude: Float[np.ndarray, " point"]) -> CurveValues:
         """ω̃² and δ at displacement amplitudes (m), with their covariance."""
-        both = zip(self.terms, (self.places.stiffness, self.places.damping), strict=True)
+        both = zip(self.terms, (self.layout.stiffness, self.layout.damping), strict=True)
         pairs = [terms.curve(amplitude, self.mean[functions]) for terms, functions in both]
         values, steep = np.moveaxis(np.array(pairs), 0, 2) / (1 + self.mean[MASS])
         rows = self.slopes(amplitude)
         covariance = np.einsum("npi,ij,nqj->npq", rows, self.covariance, rows)
-        return CurveValues(values[:, 0] + self.places.reference, values[:, 1], covariance, steep)
+        return CurveValues(values[:, 0] + self.layout.reference, values[:, 1], covariance, steep)
 
     def slopes(self, amplitude: Float[np.ndarray, " point"]) -> Float[np.ndarray, "point two n"]:
         """Derivatives of ω̃² and δ at displacement amplitudes (m) by all unknowns."""
         rows = np.zeros((len(amplitude), 2, len(self.mean)))
-        both = zip(self.terms, (self.places.stiffness, self.places.damping), strict=True)
+        both = zip(self.terms, (self.layout.stiffness, self.layout.damping), strict=True)
         for k, (terms, functions) in enumerate(both):
             own, mass = self.mean[functions], 1 + self.mean[MASS]
             rows[:, k, functions] = terms.columns(amplitude, own) / mass
@@ -198,21 +198,20 @@ def fit_test(
     discrepancy: bool = False,
     robust: bool = False,
     power_likelihood: bool = False,
-    over_sizes: bool = False,
+    average_roughness: bool = False,
     compare_levels: bool = True,
     parts_of_noise: bool = False,
     rounds: Rounds = _ALL,
 ) -> TestPosterior:
     """The posterior of a test.
 
-    Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth in phase
-    and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t); with
-    `power_likelihood` states whose neighbours miss the curves alike count as fewer; with
-    `over_sizes` curves are averaged over the roughness that they may have; without
-    `compare_levels` nothing is reported on which errors levels differ by (`differing`), which
-    takes half the time; with
-    `parts_of_noise` scatter of the natural frequency from state to state is estimated, and a noise
-    floor where no noise is stated (`StateNoise`): the posterior's `states` have them as errors.
+    Arguments: `discrepancy` adds a misfit of the single-mode model off resonance, smooth in phase
+    and amplitude and zero at phase resonance; `robust` allows outliers (Student's t);
+    `power_likelihood` counts states with correlated residuals as fewer; `average_roughness`
+    averages over the roughness of the curves; without `compare_levels` nothing is reported on how
+    levels differ (`differing`), which halves the time; `parts_of_noise` estimates the natural
+    frequency's scatter from state to state, and a noise floor where no noise is stated
+    (`StateNoise`): the posterior's `states` include them as errors.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
@@ -224,7 +223,7 @@ def fit_test(
                 discrepancy=discrepancy,
                 robust=robust,
                 power_likelihood=power_likelihood,
-                over_sizes=over_sizes,
+                average_roughness=average_roughness,
                 compare_levels=compare_levels,
             ),
             states,
@@ -233,7 +232,7 @@ def fit_test(
     n, omega = len(states.level), states.frequency
     reference = float(np.mean(omega**2))
     z = 1j * omega * states.constant * states.force / (states.velocity)
-    # Of curves: all that the test passed through, and the damping as single states have it.
+    # Units of the curves: the range of Ω² with the dynamic stiffness, and single-state damping.
     units = (
         float(np.ptp(omega**2) + _REACH * np.median(np.abs(z))),
         float(np.quantile(np.abs(z.imag / omega), 0.9) + 1e-12 * np.sqrt(reference)),
@@ -242,79 +241,80 @@ def fit_test(
     terms = CurveTerms(basis, units[0]), CurveTerms(basis, units[1])
     start = rounds.start
     if start is not None:
-        terms, reference = start.terms, start.places.reference
-    n_others = 0 if states.beside is None else states.beside.shape[1]
-    places = places_of(terms, states.n_levels, discrepancy, reference, n_others)
-    beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
-    balance = Balance(states, terms, places, np.ones(n), beside)
+        terms, reference = start.terms, start.layout.reference
+    n_others = 0 if states.other_modes is None else states.other_modes.shape[1]
+    layout = layout_of(terms, states.n_levels, discrepancy, reference, n_others)
+    discrepancy_basis = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
+    balance = Balance(states, terms, layout, np.ones(n), discrepancy_basis)
     if start is not None:
         balance = balance._replace(in_order=start.in_order)
-    walk = likeliest_walk(balance, rounds, robust=robust, power_likelihood=power_likelihood)
-    # Where neighbouring states miss the curves alike, levels may differ by what the model lacks.
-    while walk.found is not None and walk.found.equations.fraction < 1:
-        in_order = walk.balance.in_order
-        more = levels_in_order(states, walk.found.mean[places.levels])
+    solver = multistart(balance, rounds, robust=robust, power_likelihood=power_likelihood)
+    # Correlated residuals: level errors may stand in for model error. Those that correlate with
+    # force are then excluded from the level errors.
+    while solver.best is not None and solver.best.equations.fraction < 1:
+        in_order = solver.balance.in_order
+        more = levels_in_order(states, solver.best.mean[layout.levels])
         if not np.any(more > in_order):
             break
         balance = balance._replace(in_order=tuple((more | in_order).tolist()))
-        walk = likeliest_walk(balance, rounds, robust=robust, power_likelihood=power_likelihood)
-    reached = walk.found
-    if reached is None:
+        solver = multistart(balance, rounds, robust=robust, power_likelihood=power_likelihood)
+    best = solver.best
+    if best is None:
         raise ValueError(f"`rounds.most` must be at least one, not {rounds.most}.")
-    # The size of what few levels differ by is not well known: as Student's t has it. What they have
-    # in common may be anything of that size, and so may what runs with their order: the curves
-    # have it, and bands say that it may be the levels'.
-    last = walk.balance.straight(reached.mean, reached.errors, apart=False)
-    equations = last.equations._replace(fraction=reached.equations.fraction)
+    # 1σ of level errors from few levels is uncertain: widened as Student's t. Their mean, and a
+    # part correlated with force, are attributed to the curves, but the bands allow for them as
+    # level errors (`exchanged`).
+    last = solver.balance.linearised(best.mean, best.errors, apart=False)
+    equations = last.equations._replace(fraction=best.equations.fraction)
     exchanged = equations
-    if any(walk.balance.in_order):
-        free = walk.balance._replace(in_order=(False,) * 4)
-        anew = free.straight(reached.mean, reached.errors, apart=False)
+    if any(solver.balance.in_order):
+        free = solver.balance._replace(in_order=(False,) * 4)
+        anew = free.linearised(best.mean, best.errors, apart=False)
         exchanged = anew.equations._replace(fraction=equations.fraction)
 
-    variances = prior_variances(terms, places, states)
+    variances = prior_variances(terms, layout, states)
 
     def gaussian(point: np.ndarray) -> Gaussian:
         noise, variance = np.exp(point[NOISE]), variances(point)
-        # In the mean levels have no error in common: the prior of the curves' roughness would
-        # make the curves smaller, and put the rest down to the levels.
-        mean = reached.equations.posterior(noise, variance)[0]
+        # The mean has no common level error: the roughness prior would shrink the curves and shift
+        # the rest to the levels.
+        mean = best.equations.posterior(noise, variance)[0]
         covariance = equations.posterior(noise, variance)[1]
         known = variance > 0
-        informed = np.zeros_like(variance)  # curves take what they can of levels' errors
+        informed = np.zeros_like(variance)  # per unknown, after what curves absorb
         informed[known] = 1 - np.diag(covariance)[known] / variance[known]
-        for errors_of_kind, std in zip(places.levels.T, states.level_std, strict=True):
+        for errors_of_kind, std in zip(layout.levels.T, states.level_std, strict=True):
             variance[errors_of_kind] *= (
                 1.0 if std > 0 else students_factor(float(np.sum(informed[errors_of_kind]))) ** 2
             )
         wide = exchanged.posterior(noise, variance)[1]
-        return Gaussian(mean, wide, float(np.sum(informed)), np.sqrt(variance[places.levels[0]]))
+        return Gaussian(mean, wide, float(np.sum(informed)), np.sqrt(variance[layout.levels[0]]))
 
-    objective = objective_of(reached.equations, states, terms, places)
-    bounds = bounds_of(states, terms, reached.point)
-    point, summary = reached.point, gaussian(reached.point)
-    if over_sizes:
-        sized = roughness_stds(objective, reached.point, bounds)
-        point, summary = averaged(sized, gaussian)
-    flat = objective_of(reached.equations, states, terms, places, flat=True)
+    objective = objective_of(best.equations, states, terms, layout)
+    bounds = bounds_of(states, terms, best.point)
+    point, summary = best.point, gaussian(best.point)
+    if average_roughness:
+        grid = roughness_grid(objective, best.point, bounds)
+        point, summary = averaged(grid, gaussian)
+    flat = objective_of(best.equations, states, terms, layout, flat=True)
     posterior = TestPosterior(
         states,
         terms,
         summary.mean,
         summary.covariance,
         hyper_at(point, terms),
-        laplace_evidence(objective, reached.point, bounds),
-        _log_likelihood(reached),
-        reached.errors,
-        reached.residuals * np.exp(reached.point[NOISE] - point[NOISE]),
-        summary.told,
-        places,
-        differing_levels(flat, reached.point, bounds, states) if compare_levels else (False,) * 4,
-        walk.balance.weight,
-        reached.equations.fraction,
-        walk.still,
-        walk.balance.in_order,
-        remainders(reached.equations, states, terms, places, reached.point),
+        laplace_evidence(objective, best.point, bounds),
+        _log_likelihood(best),
+        best.errors,
+        best.residuals * np.exp(best.point[NOISE] - point[NOISE]),
+        summary.effective_unknowns,
+        layout,
+        differing_levels(flat, best.point, bounds, states) if compare_levels else (False,) * 4,
+        solver.balance.weight,
+        best.equations.fraction,
+        solver.converged,
+        solver.balance.in_order,
+        remainders(best.equations, states, terms, layout, best.point),
         summary.level_std,
     )
     if states.linear is None:
@@ -325,67 +325,71 @@ def fit_test(
 def _with_parts_of_noise(
     fit: Callable[..., TestPosterior], states: TestStates, rounds: Rounds
 ) -> TestPosterior:
-    """The posterior with all parts of the states' noise that the data clearly show.
+    """The posterior with all noise components that the data clearly show.
 
-    In several rounds: scatter of the frequency that is taken for noise of the phase changes the
-    modal mass, and with it the residuals. Where the phase may have been controlled the first round
-    keeps the model's mass: a mass near zero would explain the scatter without any noise.
+    Iterated, since frequency scatter treated as phase noise biases the modal mass, and with it the
+    residuals. Where the phase may have been controlled, the first fit keeps the model's mass: one
+    near zero would explain the scatter without any noise.
     """
     first = states._replace(mass_std=0.0) if states.near_one_phase else states
-    found, parts = fit(first, rounds=rounds), StateNoise(0.0, 0.0, 1.0)
+    posterior, parts = fit(first, rounds=rounds), StateNoise(0.0, 0.0, 1.0)
     for _ in range(_NOISE_ROUNDS):
         balance = Balance(
-            *(states, found.terms, found.places, found.weight),
+            *(states, posterior.terms, posterior.layout, posterior.weight),
             np.zeros((len(states.level), 0), complex),
         )
         last = parts
-        parts = noise_of_states(balance, found.mean, found.corrections, found.hyper.noise)
+        parts = noise_of_states(
+            balance, posterior.mean, posterior.corrections, posterior.hyper.noise
+        )
         same = np.allclose(parts, last, rtol=_SAME_NOISE, atol=0.0)
         if same or (not any(parts[:2]) and not any(last[:2]) and first is states):
             break
         first = states
-        found = fit(parts.of(states), rounds=rounds)
-    return found
+        posterior = fit(parts.of(states), rounds=rounds)
+    return posterior
 
 
 def _near_linear(posterior: TestPosterior) -> float:
-    """ln of the density of both curves at the smallest amplitude over that of the linear test's.
+    """ln of the prior density of both curves at the smallest amplitude, about the linear test.
 
-    A discrepancy counts by the linear test's damping too: it is no tenth of one that is a hundred
-    times larger.
+    A discrepancy is relative to the linear test's damping too, as a fitted damping a hundred times
+    larger would otherwise allow a discrepancy a hundred times larger.
     """
     at_rest = posterior.curves(np.array([posterior.states.amplitude.min()]))
-    found = np.concatenate([at_rest.squared_frequency, at_rest.modal_damping])
-    least = 1e-3  # of the linear ones: noise may take a damping below zero
-    off = np.log(np.maximum(found / np.array(posterior.states.linear), least)) / priors.NEAR_LINEAR
-    added = max(posterior.hyper.discrepancy) * np.exp(off[1] * priors.NEAR_LINEAR[1])
+    fitted = np.concatenate([at_rest.squared_frequency, at_rest.modal_damping])
+    least = 1e-3  # of the linear values: noise may make a damping negative
+    deviation = (
+        np.log(np.maximum(fitted / np.array(posterior.states.linear), least)) / priors.NEAR_LINEAR
+    )
+    added = max(posterior.hyper.discrepancy) * np.exp(deviation[1] * priors.NEAR_LINEAR[1])
     over = added / (priors.DISCREPANCY.scale * np.exp(priors.NEAR_LINEAR[1]))
-    return -0.5 * float(off @ off + over**2)
+    return -0.5 * float(deviation @ deviation + over**2)
 
 
 def levels_in_order(
     states: TestStates, errors: Float[np.ndarray, "level error"]
 ) -> Bool[np.ndarray, " error"]:
-    """Which unstated errors of levels run with the levels' forces by more than chance does."""
+    """Which unstated level errors correlate significantly with the levels' log force (F test)."""
     common, n = states.common_to_levels, states.n_levels
     if common.shape[1] < 2 or n < 3:
         return np.zeros(errors.shape[1], dtype=bool)
     constant, line = (common.T @ errors) ** 2
-    left = np.maximum(np.sum(errors**2, axis=0) - constant - line, 1e-12 * line + 1e-300)
-    chance = fdtrc(1, n - 2, line * (n - 2) / left)
+    rest = np.maximum(np.sum(errors**2, axis=0) - constant - line, 1e-12 * line + 1e-300)
+    chance = fdtrc(1, n - 2, line * (n - 2) / rest)
     return (chance < priors.IN_ORDER) & ~(np.array(states.level_std) > 0)
 
 
-def _log_likelihood(reached: Reached) -> float:
-    """ln of the density of the records, were the most likely unknowns the true ones."""
-    left, noise = reached.residuals, float(reached.point[NOISE])
+def _log_likelihood(best: Iterate) -> float:
+    """ln of the density of the records at the most likely unknowns."""
+    residuals, noise = best.residuals, float(best.point[NOISE])
     each = np.log(2 * np.pi) + 2 * noise
-    return reached.equations.offset - 0.5 * float(np.sum(left**2) + left.size * each)
+    return best.equations.offset - 0.5 * float(np.sum(residuals**2) + residuals.size * each)
 
 
 def students_factor(freedom: float) -> float:
-    """By how much a 95 % band is wider whose 1σ was found with so many degrees of freedom.
+    """Ratio of Student's t to the normal 97.5 % quantile: widening of a 95 % band.
 
-    Student's t over the normal. One counts as two: with t of one no band would be of use.
+    At least two degrees of freedom: with one the band would be useless.
     """
     return float(stdtrit(max(freedom, 2), 0.975) / ndtri(0.975))

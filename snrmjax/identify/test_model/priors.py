@@ -1,7 +1,7 @@
-"""What is taken for likely before a test is seen: every prior with its unit and its reason.
+"""Priors of the model of a test, each with its unit and its reason.
 
-Sizes are 1σ. Those of levels and of the discrepancy are the scale of a half-normal distribution
-of the size itself; those of curves and noise are medians of lognormal ones.
+Hyperparameters are 1σ. Those of levels and of the discrepancy have half-normal priors, given by
+their scale; those of curves and noise have lognormal ones, given by their median.
 """
 
 from collections.abc import Sequence
@@ -13,63 +13,63 @@ from jaxtyping import Float, Int
 _LOG_ROOT = 0.5 * np.log(2 * np.pi)
 
 
-class LogNormalSize(NamedTuple):
+class LogNormal(NamedTuple):
     """A positive number whose logarithm is normal."""
 
     median: float
     spread: float  # 1σ of the logarithm
 
 
-class HalfNormalSize(NamedTuple):
-    """A positive number: a normal one without its sign."""
+class HalfNormal(NamedTuple):
+    """A positive number: the absolute value of a normal one."""
 
     scale: float
 
 
-class NormalNumber(NamedTuple):
-    """Any number about zero."""
+class Normal(NamedTuple):
+    """A normal number of mean zero."""
 
     std: float
 
 
-class FlatSize(NamedTuple):
-    """A positive number whose logarithm is anywhere between two ends."""
+class LogUniform(NamedTuple):
+    """A positive number whose logarithm is uniform between two bounds."""
 
     low: float  # of the logarithm
     high: float
 
 
-Density = LogNormalSize | HalfNormalSize | NormalNumber | FlatSize
+Density = LogNormal | HalfNormal | Normal | LogUniform
 
 
 class JointDensity(NamedTuple):
-    """Independent densities of the numbers of a point, all at once."""
+    """Independent prior densities of a vector of hyperparameters, evaluated together."""
 
-    normal: Int[np.ndarray, " normal"]  # places of logarithms and numbers that are normal
+    normal: Int[np.ndarray, " normal"]  # indices of normal entries
     mean: Float[np.ndarray, " normal"]
     std: Float[np.ndarray, " normal"]
-    half: Int[np.ndarray, " half"]  # places of logarithms of half-normal sizes
+    half: Int[np.ndarray, " half"]  # indices of logarithms of half-normal numbers
     scale: Float[np.ndarray, " half"]  # their logarithms
     constant: float
 
     @classmethod
     def of(cls, densities: Sequence[Density | None]) -> "JointDensity":
-        """Of one density a number; None says nothing."""
+        """From one density per entry; None: flat."""
         normal, half = [], []
         constant = 0.0
-        for place, density in enumerate(densities):
-            if isinstance(density, HalfNormalSize):
-                half.append((place, np.log(density.scale)))
+        for index, density in enumerate(densities):
+            if isinstance(density, HalfNormal):
+                half.append((index, np.log(density.scale)))
                 constant += np.log(2) - _LOG_ROOT
-            elif isinstance(density, FlatSize):
+            elif isinstance(density, LogUniform):
                 constant -= np.log(density.high - density.low)
             elif density is not None:
                 pair = (
                     (np.log(density.median), density.spread)
-                    if isinstance(density, LogNormalSize)
+                    if isinstance(density, LogNormal)
                     else (0.0, density.std)
                 )
-                normal.append((place, *pair))
+                normal.append((index, *pair))
                 constant -= np.log(pair[1]) + _LOG_ROOT
         first, second = (np.array(rows).reshape(-1, k) for rows, k in ((normal, 3), (half, 2)))
         return cls(
@@ -80,7 +80,7 @@ class JointDensity(NamedTuple):
     def log_density(
         self, point: Float[np.ndarray, " number"]
     ) -> tuple[float, Float[np.ndarray, " number"]]:
-        """ln p, and its slopes."""
+        """ln p, and its gradient."""
         slopes = np.zeros(len(point))
         step = (point[self.normal] - self.mean) / self.std
         off = point[self.half] - self.scale
@@ -90,45 +90,45 @@ class JointDensity(NamedTuple):
         return value + self.constant, slopes
 
 
-STATED_NOISE = LogNormalSize(1.0, 0.1)
-"""Noise over the stated one: standard deviations from ten readings are good to some 20 %, and a
+STATED_NOISE = LogNormal(1.0, 0.1)
+"""Noise over the stated noise: a standard deviation from ten readings is good to some 20 %, and a
 laboratory states the mean of many."""
 
-UNSTATED_NOISE = LogNormalSize(0.004, 1.2)
-"""Relative noise of velocities, rad of phases, where none is stated: analysers reach 0.05 %, hand
-evaluation some 3 %."""
+UNSTATED_NOISE = LogNormal(0.004, 1.2)
+"""Noise where none is stated, relative for velocities and rad for phases: analysers reach 0.05 %,
+manual readings some 3 %."""
 
 FORCE_TO_VELOCITY = 0.1
-"""Error of a force of which none is stated, over that of the velocity: calibrated load cells."""
+"""Unstated error of the force over that of the velocity: calibrated load cells."""
 
-LEVEL_GAIN = HalfNormalSize(0.05)
+LEVEL_GAIN = HalfNormal(0.05)
 """Relative: drift of conditioners and of a shaker's coupling between levels; published tests show
 15 %."""
 
-LEVEL_PHASE = HalfNormalSize(0.02)
-"""rad: 1.1°, a filter's or a controller's between levels; hand-made tests show 3°."""
+LEVEL_PHASE = HalfNormal(0.02)
+"""rad: 1.1°, drift of a filter or controller between levels; manually run tests show 3°."""
 
-LEVEL_STIFFNESS = HalfNormalSize(0.008)
-"""Relative, of ω̃²: 0.4 % of frequency, some 20 K of temperature in metals, or a joint's seat."""
+LEVEL_STIFFNESS = HalfNormal(0.008)
+"""Relative, of ω̃²: 0.4 % of frequency, as 20 K in metals or the reseating of a joint."""
 
-LEVEL_DAMPING = HalfNormalSize(0.05)
-"""Relative: joints and clamps that are opened between levels repeat to some 10 %."""
+LEVEL_DAMPING = HalfNormal(0.05)
+"""Relative: joints and clamps reopened between levels repeat to some 10 %."""
 
 NEAR_LINEAR = (0.5, 1.5)
 """1σ of ln ω̃² and of ln δ at the smallest measured amplitude about the linear test's: friction and
-stops change damping tenfold. Where amplitude tells all states of a sweep apart, some smooth curves
-fit with any modal mass; one a thousand times off has no resonance near the test."""
+stops change damping tenfold. Where all states of a sweep differ in amplitude, some smooth curve
+fits with any modal mass; a mass a thousand times off has no resonance near the test."""
 
 INSTRUMENT_PHASE = 0.1
-"""rad: 6°, of all records together, where a hypothesis may be that there is one."""
+"""rad: 6°, common to all records, where a phase error is a hypothesis."""
 
 OFF_RESONANCE = (0.5, 1.0)
-"""1σ of d ln(what the motion adds to ω̃², and of 2ζ̃ω̃) / d ln Ω at equal amplitude, of which a
-curve of amplitude knows nothing. Damping: −1 for dry friction and hysteresis, 1 for v|v|, 2 for v³;
-stiffness: 0 where harmonics are small, 0.75 on an arch, whose static and second harmonic soften
-it."""
+"""1σ of d ln(amplitude-dependent part of ω̃², and of 2ζ̃ω̃) / d ln Ω at equal amplitude, which a
+curve of amplitude alone lacks. Damping: −1 for dry friction and hysteresis, 1 for v|v|, 2 for v³;
+stiffness: 0 where harmonics are small, 0.75 on an arch, which its static and second harmonic
+soften."""
 
-LEVELS: tuple[HalfNormalSize, ...] = (
+LEVELS: tuple[HalfNormal, ...] = (
     LEVEL_GAIN,
     LEVEL_PHASE,
     LEVEL_STIFFNESS,
@@ -137,53 +137,53 @@ LEVELS: tuple[HalfNormalSize, ...] = (
 """In the order of `LEVEL_ERRORS`."""
 
 ONE_FORCE = 0.1
-"""Of the logarithm of levels' forces: closer levels repeat one another."""
+"""Of the logarithm of levels' forces: closer levels are repeats of one another."""
 
 ONE_PHASE = 0.03
-"""rad, from their mean, up to which states count as all of one phase: 1.7°, as phase controllers
-keep it. Steps of that size say less on a modal mass than phases' own errors."""
+"""rad about their mean, within which all states count as at one phase: 1.7°, as phase controllers
+hold it. Such differences carry less on the modal mass than the phase errors themselves."""
 
 NEAR_ONE_PHASE = 0.4
-"""rad, from their mean: half of the way to the half-power points. States that stay within it may
-have had their phase controlled."""
+"""rad about their mean: half way to the half-power points. States within it may have been measured
+under phase control."""
 
 IN_ORDER = 0.01
-"""Probability by chance of a line over the levels' forces, below which their errors run with it:
-they are then no errors of levels, which know nothing of one another."""
+"""p-value of a line of level errors over log force, below which they correlate with force: level
+errors proper are independent of one another."""
 
 LEVELS_DIFFER = 5.41
-"""Of −2 ln p, from which on levels are said to differ: 1 %, one-sided, as four kinds are tried."""
+"""Of −2 ln p, from which levels differ significantly: 1 %, one-sided, as four kinds are tried."""
 
 CURVE_CONSTANT = 1.0
-"""Of the mean of both curves, over ω² and over the typical damping: nothing is assumed."""
+"""1σ of the mean of both curves, over ω² and over the typical damping: uninformative."""
 
 CURVE_SLOPES = 1.0
-"""Of their terms in a²: changes as large as the curves themselves."""
+"""1σ of their terms in a²: changes as large as the curves themselves."""
 
-CURVE_ROUGHNESS = LogNormalSize(1e-3, 2.0)
-"""Size of the bends at some twenty knots, over the same: nothing to as much as the curve."""
+CURVE_ROUGHNESS = LogNormal(1e-3, 2.0)
+"""1σ of the roughness at some twenty knots, over the same: from none to as large as the curve."""
 
 NO_REMAINDER = 0.3
-"""Probability that a family of curves leaves nothing: real structures are hardly in a library."""
+"""Prior probability that a family fits exactly: real structures seldom follow a library law."""
 
 REMAINDER_BY_CHANCE = 0.05
-"""Probability that a family leaves nothing, below which its remainder is drawn."""
+"""Probability of no remainder, below which the remainder of a family is fitted."""
 
-ROUGHNESS_VARIES = NormalNumber(1.0)
-"""Of the logarithm of that size along a curve: where joints open a curve bends thrice as much."""
+ROUGHNESS_VARIES = Normal(1.0)
+"""Of the logarithm of that 1σ along a curve: where joints open, roughness is thrice as large."""
 
-SIZES_ALIKE = 2.0
-"""Bends, over which they are of one size."""
+ROUGHNESS_LENGTH = 2.0
+"""Knots over which the 1σ of the roughness is correlated."""
 
-DISCREPANCY = HalfNormalSize(0.1)
-"""Of Ωδ: what a single mode leaves off resonance. Measured beams show 1 to 5 %, joints that slip
+DISCREPANCY = HalfNormal(0.1)
+"""Of Ωδ: misfit of a single-mode model off resonance. Measured beams show 1 to 5 %, slipping joints
 some 20 %."""
 
 DISCREPANCY_LENGTH = np.radians(30.0)
-"""Phase over which a discrepancy changes."""
+"""Correlation length of the discrepancy in phase."""
 
 STUDENT_FREEDOM = 4.0
-"""Degrees of freedom of noise with outliers, on request: one state in 20 beyond three times 1σ."""
+"""Student's t degrees of freedom of noise with outliers: one state in 20 lies beyond 3σ."""
 
 LEAST_FRACTION = 0.1
-"""Of states that tell something of their own: from curves that are far off fewer seem to."""
+"""Lower bound of the independent fraction of the states: while curves are far off it is too low."""

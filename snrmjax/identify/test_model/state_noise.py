@@ -1,11 +1,10 @@
-"""What the states of a test scatter by beyond one size of noise.
+"""Components of the states' noise beyond a single level: noise floor and frequency scatter.
 
-Noise of velocities that nobody stated is relative in part (gains, frequency steps) and absolute in
-part (the floor of an amplifier): over a wide range of amplitudes one size of either is wrong at
-both ends. The natural frequency itself may scatter from state to state, and so does the frequency
-that a phase controller sets; this matters most where the mode is driven hardest. Taken for noise of
-the phase it would give a modal mass that is too small. The residuals of a fit say how large each
-part is.
+Unstated noise of velocities is partly relative (gains, frequency steps) and partly absolute (the
+floor of an amplifier): over a wide range of amplitudes either alone is wrong at both ends. The
+natural frequency may also scatter from state to state, as does the frequency that a phase
+controller sets; this dominates at large amplitudes. Treated as phase noise it would bias the modal
+mass low. The residuals of a fit determine the size of each component.
 """
 
 import itertools
@@ -17,42 +16,43 @@ from scipy.optimize import minimize
 from snrmjax.identify.test_model.balance import Balance, whitening
 from snrmjax.identify.test_model.states import RECORDED, TestStates
 
-_CLEARLY = 20.0  # of −2 ln p, to believe in noise of a kind that nobody stated
-_LEAST = 0.01  # of the noise, that is never of another kind: others are in units of it
-_OF_FLOOR = 0.05  # of the floor at a typical state, that the relative noise is at least
-_START = 0.5  # of the noise, from which a part is looked for
+_CLEARLY = 20.0  # of −2 ln p, to accept an unstated noise component
+_LEAST = 0.01  # lower bound of the relative component, the unit of the others
+_OF_FLOOR = 0.05  # its lower bound over the floor at a typical state
+_START = 0.5  # of the noise: starting value of each component
 
 
 class StateNoise(NamedTuple):
-    """Parts of the states' noise beyond the first, zero where the states ask for none."""
+    """Noise components beyond the relative one; zero where the data show none."""
 
-    stiffness: float  # 1σ of a relative stiffness that wanders
-    floor: float  # 1σ of velocities, m/s, for each of both parts
-    noise: float  # that is left for the first part, as `Hyper.noise`
+    stiffness: float  # 1σ of the stiffness scatter, relative
+    floor: float  # 1σ of real and imaginary velocity, m/s
+    noise: float  # remaining relative component, as `Hyper.noise`
 
     def of(self, states: TestStates) -> TestStates:
-        """The states with these errors too, over the noise that is left."""
+        """The states with these errors added, in units of the remaining noise."""
         errors = states.errors[:, :RECORDED].copy()
         floor = self.floor / (self.noise * np.abs(states.velocity))
         errors[:, 1:] = np.hypot(errors[:, 1:], floor[:, None])
         if self.stiffness > 0:
-            wander = np.full(len(errors), self.stiffness / self.noise)
-            errors = np.column_stack([errors, wander])
+            scatter = np.full(len(errors), self.stiffness / self.noise)
+            errors = np.column_stack([errors, scatter])
         return states._replace(errors=errors)
 
 
 def noise_of_states(
     balance: Balance, unknowns: np.ndarray, errors: np.ndarray, noise: float
 ) -> StateNoise:
-    """The parts that the residuals clearly show, by maximum likelihood.
+    """The components that the residuals clearly show, by maximum likelihood.
 
-    A stated noise includes its floor. Where all states have one phase, the frequency scatters.
-    Arguments: `balance` of states with errors of one size; `unknowns` and `errors` of the fit, and
-    its `noise` over these.
+    Stated noise includes its floor. Where all states have one phase, frequency scatter is always
+    included.
+    Arguments: `balance` of states without these components; `unknowns`, `errors` and `noise` of the
+    fit.
     """
     states, now = balance.states, balance.at(unknowns, errors)
-    gap = now.z - now.model - np.sum(now.by_error * errors, axis=1)
-    parts_of_gap = np.stack([gap.real, gap.imag], axis=1)
+    residual = now.z - now.model - np.sum(now.by_error * errors, axis=1)
+    residual_parts = np.stack([residual.real, residual.imag], axis=1)
     slopes = now._replace(inputs=RECORDED + 1).by_error
     base = noise * states.errors[:, :RECORDED]
     floor = 1 / np.abs(states.velocity)  # of 1 m/s
@@ -60,28 +60,28 @@ def noise_of_states(
     typical = noise * np.median(np.abs(states.velocity))
 
     def parts(point: np.ndarray, kinds: tuple[bool, bool]) -> np.ndarray:
-        found = np.zeros(3)
-        found[[True, *kinds]] = np.exp(point)
-        found[0] = max(found[0], _LEAST, _OF_FLOOR * found[2] / typical)
-        return found
+        stds = np.zeros(3)
+        stds[[True, *kinds]] = np.exp(point)
+        stds[0] = max(stds[0], _LEAST, _OF_FLOOR * stds[2] / typical)
+        return stds
 
     def criterion(point: np.ndarray, kinds: tuple[bool, bool]) -> float:
-        own, wander, second = parts(point, kinds)
-        std = np.column_stack([own * base, np.full(len(base), wander)])
+        own, scatter, second = parts(point, kinds)
+        std = np.column_stack([own * base, np.full(len(base), scatter)])
         std[:, 1:RECORDED] = np.hypot(std[:, 1:RECORDED], (second * floor)[:, None])
         root, log_det = whitening(slopes, std, balance.weight)
-        white = np.einsum("nij,nj->ni", root, parts_of_gap)
+        white = np.einsum("nij,nj->ni", root, residual_parts)
         return float(np.sum(white**2)) + log_det
 
-    # Each part as large as the first at a typical state.
-    size = np.median(np.abs(noise * now.z) / np.abs(now.stiffness))
-    start = np.log(_START * np.array([1.0, size, typical]))
+    # Start: each component as large as the relative one at a typical state.
+    stiffness_std = np.median(np.abs(noise * now.z) / np.abs(now.stiffness))
+    start = np.log(_START * np.array([1.0, stiffness_std, typical]))
     best = (np.inf, np.zeros(3))
-    wander = (True,) if states.of_one_phase else (False, True)
-    for kinds in itertools.product(wander, (False, True)[: 2 - states.stated]):
-        found = minimize(criterion, start[[True, *kinds]], args=(kinds,), method="Nelder-Mead")
-        value = found.fun + _CLEARLY * sum(kinds)
+    scatter = (True,) if states.of_one_phase else (False, True)
+    for kinds in itertools.product(scatter, (False, True)[: 2 - states.stated]):
+        minimum = minimize(criterion, start[[True, *kinds]], args=(kinds,), method="Nelder-Mead")
+        value = minimum.fun + _CLEARLY * sum(kinds)
         if value < best[0]:
-            best = value, parts(found.x, kinds)
+            best = value, parts(minimum.x, kinds)
     own, stiffness, second = best[1].tolist()
     return StateNoise(stiffness, second, own * noise)

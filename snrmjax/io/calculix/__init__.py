@@ -1,9 +1,9 @@
-"""Reduced models through CalculiX: its decks, its jobs and its results.
+"""Reduced-order models from CalculiX: input decks, jobs and results.
 
 A user's deck with its own mesh, sections, materials and supports gives linear modes
 (`modes_of_deck`) and geometrically nonlinear static load cases (`run_static_cases`), from which
-`snrmjax.condense` fits a reduced model. Beams and shells are CalculiX's own, which are solids
-inside: reference G. Dhondt, "The Finite Element Method for Three-Dimensional Thermomechanical
+`snrmjax.condense` fits a reduced model. CalculiX expands its beams and shells into solids.
+Reference: G. Dhondt, "The Finite Element Method for Three-Dimensional Thermomechanical
 Applications", Wiley 2004, doi:10.1002/0470021217.
 """
 

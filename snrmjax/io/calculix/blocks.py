@@ -1,4 +1,4 @@
-"""The text of an input deck as keyword blocks: included files in their place, comments left out."""
+"""An input deck as keyword blocks, with included files inserted and comments dropped."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,20 +10,20 @@ _DEEPEST_INCLUDE = 20
 
 
 class Line(NamedTuple):
-    """A line of a deck and where it stands."""
+    """A line of a deck with its file and line number."""
 
     text: str
     file: str
     number: int  # in its file, from one
 
     @property
-    def place(self) -> str:
-        """Where it stands, as messages say it."""
+    def location(self) -> str:
+        """File and line number, for messages."""
         return f"{self.file}, line {self.number}"
 
     @property
     def entries(self) -> list[str]:
-        """What stands between its commas; a comma at the end adds nothing."""
+        """The comma-separated entries; a trailing comma adds none."""
         parts = [part.strip() for part in self.text.split(",")]
         return parts[:-1] if len(parts) > 1 and not parts[-1] else parts
 
@@ -42,23 +42,23 @@ class Block(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The block as it stands in a deck."""
+        """The block as text of a deck."""
         values = [f"{name}={value}" if value else name for name, value in self.parameters.items()]
         rows = [line.text for line in self.data]
         return "\n".join(["*" + ", ".join([self.keyword, *values]), *rows])
 
     def with_parameters(self, **changed: str | None) -> "Block":
-        """With other values of parameters; None takes one away."""
+        """With changed parameter values; None removes a parameter."""
         kept = {**self.parameters, **{name: value or "" for name, value in changed.items()}}
         gone = [name for name, value in changed.items() if value is None]
         return self._replace(parameters={n: v for n, v in kept.items() if n not in gone})
 
 
 def read_blocks(path: FilePath) -> list[Block]:
-    """The keyword blocks of a deck, those of its *INCLUDE files in their place.
+    """The keyword blocks of a deck, *INCLUDE files inserted.
 
-    Returns blocks in the deck's order. Raises `ValueError` where a file is missing, includes
-    itself, or data stand before the first keyword.
+    Returns the blocks in the order of the deck. Raises `ValueError` where a file is missing or
+    includes itself, and for data before the first keyword.
     """
     lines = list(_lines(Path(path), ()))
     blocks: list[Block] = []
@@ -67,7 +67,7 @@ def read_blocks(path: FilePath) -> list[Block]:
         head = lines[position]
         if not head.text.startswith("*"):
             raise ValueError(
-                f"{head.place}: {shown(head.text)} stands before the first keyword (*NODE, ...)."
+                f"{head.location}: {shown(head.text)} comes before the first keyword (*NODE, ...)."
             )
         text = head.text
         while text.endswith(",") and position + 1 < len(lines):  # a keyword on several lines
@@ -85,7 +85,7 @@ def read_blocks(path: FilePath) -> list[Block]:
 
 
 def _lines(path: Path, above: tuple[Path, ...]) -> Iterator[Line]:
-    """Lines that say something, those of included files in their place."""
+    """Lines other than blanks and comments, with included files inserted."""
     name = file_name(path)
     for number, raw in enumerate(read_text(path).splitlines(), start=1):
         text = raw.strip()
@@ -104,10 +104,10 @@ def _included(line: Line, path: Path, above: tuple[Path, ...]) -> Iterator[Line]
         value.strip().strip('"') for key, value in values.items() if key.strip().upper() == "INPUT"
     ]
     if not given:
-        raise ValueError(f"{line.place}: *INCLUDE needs INPUT=file.")
+        raise ValueError(f"{line.location}: *INCLUDE needs INPUT=file.")
     target = path.parent / given[0]
     if target in above or len(above) > _DEEPEST_INCLUDE:
-        raise ValueError(f"{line.place}: {given[0]} includes itself.")
+        raise ValueError(f"{line.location}: {given[0]} includes itself.")
     if not target.is_file():
-        raise ValueError(f"{line.place}: the included file {given[0]} does not exist.")
+        raise ValueError(f"{line.location}: the included file {given[0]} does not exist.")
     yield from _lines(target, above)

@@ -1,4 +1,4 @@
-"""A user's CalculiX deck: its mesh, what is checked of it, and the text that jobs start from."""
+"""A user's CalculiX deck: its mesh, its checks, and the model text of the jobs."""
 
 import re
 
@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from snrmjax.io.calculix.blocks import Block, Line, read_blocks
 from snrmjax.io.files import FilePath, file_name, shown
 
-# CalculiX reads a coordinate from this many characters and drops the rest without a word.
+# CalculiX reads a coordinate from this many characters and silently drops the rest.
 _COORDINATE_WIDTH = 20
 _ELASTIC = ("ELASTIC", "HYPERELASTIC", "HYPERFOAM")
 _LOSSY = (
@@ -26,19 +26,19 @@ _REFUSED = {
     "PART": "CalculiX reads no parts and assemblies; in Abaqus/CAE choose `Do not use parts and "
     "assemblies in input files`",
 }
-# What steps say that changes nothing about the structure, and need not be said to be left out.
+# Step keywords that do not change the structure: left out without a note.
 _QUIET = {
     *("STEP", "END STEP", "BOUNDARY", "STATIC", "FREQUENCY", "BUCKLE", "CONTROLS", "HEADING"),
     *("NODE PRINT", "EL PRINT", "NODE FILE", "EL FILE", "NODE OUTPUT", "ELEMENT OUTPUT", "OUTPUT"),
     *("RESTART", "MONITOR", "PRINT"),
 }
-_RIGID_ZERO = 1e-9  # prescribed displacements up to here count as none
+_RIGID_ZERO = 1e-9  # prescribed displacements up to this value count as zero
 
 
 class Deck(eqx.Module):
     """The model part of a CalculiX deck: everything before its first step, as text and mesh.
 
-    Supports inside the first step belong to it; loads and outputs of the steps are left out
+    Supports of the first step are included; loads and outputs of the steps are left out
     (`left_out` names their keywords). Lengths, moduli and densities are in the deck's units: a
     deck in metres, pascals and kilograms gives a model in SI units.
     """
@@ -51,10 +51,10 @@ class Deck(eqx.Module):
     element_types: tuple[str, ...] = eqx.field(static=True)
     thickness: float = eqx.field(static=True)  # m, the smallest of its sections
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
-    small_displacements: bool = eqx.field(static=True, default=False)  # its steps, all of them
+    small_displacements: bool = eqx.field(static=True, default=False)  # no step has NLGEOM
 
     def node_index(self, number: int) -> int:
-        """Row of a node in `nodes`. Raises `ValueError` where no element has it."""
+        """Index of a node in `nodes`. Raises `ValueError` where no element has it."""
         rows = np.flatnonzero(self.nodes == number)
         if not len(rows):
             raise ValueError(
@@ -65,19 +65,19 @@ class Deck(eqx.Module):
 
     def nearest_node(self, point: tuple[float, float, float]) -> int:
         """The number of the node next to a point (m)."""
-        away = np.linalg.norm(self.coordinates - np.asarray(point), axis=1)
-        return int(self.nodes[int(np.argmin(away))])
+        distance = np.linalg.norm(self.coordinates - np.asarray(point), axis=1)
+        return int(self.nodes[int(np.argmin(distance))])
 
 
 def read_deck(path: FilePath) -> Deck:
     """Read a CalculiX input deck (or one of Abaqus without parts) of beams, shells or solids.
 
-    Keywords that are not known here are kept as they stand, *INCLUDE files read in their place.
+    Unknown keywords are kept unchanged, *INCLUDE files are inserted.
 
     Arguments: `path` of the deck. Returns the `Deck`. Raises `ValueError`, with file and line, for
-    what a condensation cannot use: no mesh, an element or a support with a missing node, a
-    prescribed displacement, a material without density or elastic law, plasticity and other
-    materials with losses, contact, local coordinate systems.
+    anything a condensation cannot use: no mesh, an element or a support with a missing node, a
+    prescribed displacement, a material without density or elastic constants, plasticity and other
+    dissipative materials, contact, local coordinate systems.
     """
     blocks = read_blocks(path)
     name = file_name(path)
@@ -102,7 +102,7 @@ def read_deck(path: FilePath) -> Deck:
 
 
 def _split(blocks: list[Block]) -> tuple[list[Block], list[Block], tuple[str, ...]]:
-    """The model part, supports of the first step, and keywords of steps that are left out."""
+    """The model part, the supports of the first step, and the step keywords left out."""
     first = next((i for i, b in enumerate(blocks) if b.keyword == "STEP"), len(blocks))
     supports, left_out, step = [], [], 0
     for block in blocks[first:]:
@@ -117,7 +117,7 @@ def _split(blocks: list[Block]) -> tuple[list[Block], list[Block], tuple[str, ..
 
 
 def _small_displacements(blocks: list[Block]) -> bool:
-    """Whether there are steps and none of them has large displacements."""
+    """Whether there are steps, and all are geometrically linear."""
     steps = [block for block in blocks if block.keyword == "STEP"]
     large = [s for s in steps if "NLGEOM" in s.parameters and s.named("NLGEOM") != "NO"]
     return bool(steps) and not large
@@ -134,7 +134,7 @@ def _thickness(blocks: list[Block], coordinates: Float[np.ndarray, "node 3"]) ->
             dimensions += [_number(line, entry, "a dimension") for entry in entries if entry]
             if dimensions[-1:] and not min(dimensions) > 0:
                 raise ValueError(
-                    f"{line.place}: dimensions of a section must be positive, but one is "
+                    f"{line.location}: dimensions of a section must be positive, but one is "
                     f"{min(dimensions):g}."
                 )
     if dimensions:
@@ -147,13 +147,13 @@ def _number(line: Line, entry: str, wanted: str) -> float:
     try:
         return float(re.sub("[dD]", "e", entry))
     except ValueError as error:
-        raise ValueError(f"{line.place}: {shown(entry)} where {wanted} is expected.") from error
+        raise ValueError(f"{line.location}: {shown(entry)} where {wanted} is expected.") from error
 
 
 def _label(line: Line, entry: str, wanted: str) -> int:
     value = _number(line, entry, wanted)
     if not value.is_integer() or value < 1:
-        raise ValueError(f"{line.place}: {shown(entry)} where {wanted} is expected.")
+        raise ValueError(f"{line.location}: {shown(entry)} where {wanted} is expected.")
     return int(value)
 
 
@@ -163,14 +163,14 @@ def _nodes(blocks: list[Block], name: str) -> dict[int, tuple[float, ...]]:
         if block.keyword != "NODE":
             continue
         for line in block.data:
-            label, *places = line.entries
-            for entry in places[:3]:
+            label, *coordinates = line.entries
+            for entry in coordinates[:3]:
                 if len(entry) > _COORDINATE_WIDTH:
                     raise ValueError(
-                        f"{line.place}: the coordinate {entry} has {len(entry)} characters; "
+                        f"{line.location}: the coordinate {entry} has {len(entry)} characters; "
                         f"CalculiX reads {_COORDINATE_WIDTH} and would drop the rest."
                     )
-            values = [_number(line, entry, "a coordinate") for entry in places[:3] if entry]
+            values = [_number(line, entry, "a coordinate") for entry in coordinates[:3] if entry]
             number = _label(line, label, "a node number")
             nodes[number] = tuple((*values, 0.0, 0.0, 0.0)[:3])
     if not nodes:
@@ -187,13 +187,13 @@ def _elements(
     types: list[str] = []
     for block in blocks:
         if block.keyword in _REFUSED:
-            raise ValueError(f"{block.head.place}: *{block.keyword}: {_REFUSED[block.keyword]}.")
+            raise ValueError(f"{block.head.location}: *{block.keyword}: {_REFUSED[block.keyword]}.")
         if block.keyword != "ELEMENT":
             continue
         types.append(block.named("TYPE"))
         if types[-1].startswith("U"):
-            raise ValueError(f"{block.head.place}: {types[-1]}: {_REFUSED['USER ELEMENT']}.")
-        continued, size = 0, _nodes_of_type(types[-1])
+            raise ValueError(f"{block.head.location}: {types[-1]}: {_REFUSED['USER ELEMENT']}.")
+        continued, n_nodes = 0, _nodes_of_type(types[-1])
         for line in block.data:
             numbers = [_label(line, e, "a node or element number") for e in line.entries if e]
             members = numbers if continued else numbers[1:]
@@ -202,11 +202,11 @@ def _elements(
             missing = [number for number in members if number not in nodes]
             if missing:
                 raise ValueError(
-                    f"{line.place}: the element has node {missing[0]}, which no *NODE block has."
+                    f"{line.location}: the element has node {missing[0]}, which no *NODE block has."
                 )
             used.update(members)
             continued += len(members)
-            if continued >= size or (size == 0 and not line.text.endswith(",")):
+            if continued >= n_nodes or (n_nodes == 0 and not line.text.endswith(",")):
                 continued = 0
     if not used:
         raise ValueError(f"{name} has no *ELEMENT block with elements before its first *STEP.")
@@ -214,7 +214,7 @@ def _elements(
 
 
 def _nodes_of_type(kind: str) -> int:
-    """How many nodes an element has, by its name, or zero where its lines have to tell."""
+    """Nodes per element of a type; zero where only the data lines show it."""
     solids = re.match(r"(?:C3D|S|CPS|CPE|CAX|M3D|DC3D)(\d+)", kind)
     if solids:
         return int(solids[1])
@@ -225,7 +225,7 @@ def _nodes_of_type(kind: str) -> int:
 
 
 def _node_sets(blocks: list[Block]) -> set[str]:
-    """Names, in capitals, that stand for nodes."""
+    """Names of the node sets, in capitals."""
     names = {block.named("NSET") for block in blocks if block.keyword in ("NODE", "NSET")}
     return names - {""}
 
@@ -235,17 +235,17 @@ def _check_supports(blocks: list[Block], nodes: set[int], sets: set[str]) -> Non
         if block.keyword != "BOUNDARY":
             continue
         for line in block.data:
-            who, *rest = line.entries
-            if who.isdigit() and int(who) not in nodes:
+            target, *rest = line.entries
+            if target.isdigit() and int(target) not in nodes:
                 raise ValueError(
-                    f"{line.place}: the support is at node {who}, which no *NODE block has."
+                    f"{line.location}: the support is at node {target}, which no *NODE block has."
                 )
-            if not who.isdigit() and who.upper() not in sets:
-                raise ValueError(f"{line.place}: no node set is called {shown(who)}.")
+            if not target.isdigit() and target.upper() not in sets:
+                raise ValueError(f"{line.location}: no node set is called {shown(target)}.")
             value = rest[2] if len(rest) > 2 else ""
             if value and abs(_number(line, value, "a displacement")) > _RIGID_ZERO:
                 raise ValueError(
-                    f"{line.place}: the displacement {value} is prescribed; supports of a "
+                    f"{line.location}: the displacement {value} is prescribed; supports of a "
                     "condensation do not move."
                 )
 
@@ -255,8 +255,8 @@ def _check_materials(blocks: list[Block], name: str) -> None:
     for lossy in _LOSSY:
         if lossy in keywords:
             raise ValueError(
-                f"{keywords[lossy].head.place}: *{lossy}: a reduced stiffness has a potential, so "
-                "that the material must be elastic (*ELASTIC, *HYPERELASTIC)."
+                f"{keywords[lossy].head.location}: *{lossy}: a reduced stiffness has a potential, "
+                "so that the material must be elastic (*ELASTIC, *HYPERELASTIC)."
             )
     if not any(keyword in keywords for keyword in _ELASTIC):
         raise ValueError(f"{name} has no *ELASTIC or *HYPERELASTIC material.")
@@ -267,7 +267,7 @@ def _check_materials(blocks: list[Block], name: str) -> None:
                 value = _number(line, line.entries[0], "a number")
                 if not value > 0:
                     raise ValueError(
-                        f"{line.place}: *{keyword} must be positive, but is {value:g}."
+                        f"{line.location}: *{keyword} must be positive, but is {value:g}."
                     )
     if "DENSITY" not in keywords and "MASS" not in keywords:
         raise ValueError(f"{name} has no *DENSITY: modes need a mass.")

@@ -1,4 +1,4 @@
-"""Running CalculiX: one job in a folder of its own, on one thread, with what became of it."""
+"""Running CalculiX: one job in its own folder, on one thread, with its outcome."""
 
 import hashlib
 import os
@@ -17,7 +17,7 @@ INSTALL = (
     "CalculiX is needed and its program {program} is not on the search path: install it (Debian, "
     "Ubuntu: apt install calculix-ccx; conda-forge: calculix) or name its program."
 )
-# What CalculiX may be told to spread over threads by; a job here has one.
+# Environment variables that set CalculiX's number of threads; a job here has one.
 _THREADS = (
     *("OMP_NUM_THREADS", "CCX_NPROC_STIFFNESS", "CCX_NPROC_EQUATION_SOLVER", "CCX_NPROC_RESULTS"),
     *("OPENBLAS_NUM_THREADS", "CCX_NPROC_CFD", "CCX_NPROC_VIEWFACTOR"),
@@ -26,24 +26,24 @@ _BEGUN = "increment 1 attempt 1"  # in the log, once the deck is read and a stat
 
 
 class JobOutcome(NamedTuple):
-    """What became of a job."""
+    """Outcome of a job."""
 
     started: bool  # a static step began, or the program printed results
-    finished: bool  # the program came to its end, with an error or not
-    dat: str  # what it printed of results
+    finished: bool  # the program ended by itself, with or without an error
+    dat: str  # the results it printed
     error: str  # its first error, or how it ended
     seconds: float
 
 
 class Calculix(NamedTuple):
-    """The program and how long a job of it may run."""
+    """The program and the time limit of a job."""
 
     program: str
     time_limit: float  # s
 
 
-def found_calculix(program: str, time_limit: float) -> Calculix:
-    """The program on this machine. Raises `ValueError` where it is not there or not a program."""
+def find_calculix(program: str, time_limit: float) -> Calculix:
+    """The program on this machine. Raises `ValueError` where it is missing."""
     path = shutil.which(program)
     if path is None:
         raise ValueError(INSTALL.format(program=program))
@@ -53,30 +53,30 @@ def found_calculix(program: str, time_limit: float) -> Calculix:
 
 
 def model_file(text: str, folder: FilePath) -> Path:
-    """Write a deck's model into a folder, made where it is missing, for jobs to include.
+    """Write a deck's model, for jobs to include, into a folder (created if missing).
 
-    Returns its path; the name has a digest of the text, so that two models never share a file.
+    Returns its path; the name contains a digest of the text, so that two models never share a file.
     """
-    place = Path(folder)
+    target = Path(folder)
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"the folder {place} cannot be made: {error.strerror}.") from error
-    path = place / f"model-{deck_digest(text)}.inp"
+        raise ValueError(f"the folder {target} cannot be made: {error.strerror}.") from error
+    path = target / f"model-{deck_digest(text)}.inp"
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         write_atomically(path, text)
     return path
 
 
 def deck_digest(text: str) -> str:
-    """What a deck is known by: sixteen hexadecimal digits of its SHA-256."""
+    """Identifier of a deck: sixteen hexadecimal digits of its SHA-256."""
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
 
 
 def run_job(calculix: Calculix, model: Path, step: str) -> JobOutcome:
     """Run one job: a model file, included, and the steps below it.
 
-    The job's files live in a temporary folder beside the model and go with it.
+    The job's files are in a temporary folder next to the model, removed afterwards.
     """
     with tempfile.TemporaryDirectory(dir=model.parent, prefix="job-") as folder:
         Path(folder, "job.inp").write_text(
@@ -104,10 +104,10 @@ def run_job(calculix: Calculix, model: Path, step: str) -> JobOutcome:
         seconds = time.perf_counter() - begin
         dat = Path(folder, "job.dat")
         printed = dat.read_text(encoding="utf-8", errors="replace") if dat.is_file() else ""
-        said = Path(folder, "job.log").read_text(encoding="utf-8", errors="replace")
+        log_text = Path(folder, "job.log").read_text(encoding="utf-8", errors="replace")
     if not stopped and process.returncode < 0:
         stopped = f"killed by {signal.Signals(-process.returncode).name}"
-    error = stopped or first_error(said)
+    error = stopped or first_error(log_text)
     if not error and process.returncode:
         error = f"it ended with code {process.returncode}"
-    return JobOutcome(bool(printed) or _BEGUN in said, not stopped, printed, error, seconds)
+    return JobOutcome(bool(printed) or _BEGUN in log_text, not stopped, printed, error, seconds)

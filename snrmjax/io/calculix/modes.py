@@ -1,4 +1,4 @@
-"""Linear modes of a CalculiX deck, and the nodal forces and filter that belong to them."""
+"""Linear modes of a CalculiX deck, with their nodal forces and modal filter."""
 
 from collections.abc import Sequence
 
@@ -9,18 +9,18 @@ from jaxtyping import Float
 
 from snrmjax.condense.load_cases import ReductionBasis
 from snrmjax.io.calculix.deck import Deck
-from snrmjax.io.calculix.jobs import Calculix, found_calculix, model_file, run_job
+from snrmjax.io.calculix.jobs import Calculix, find_calculix, model_file, run_job
 from snrmjax.io.calculix.results import eigenvalues, printed_tables
 from snrmjax.io.files import FilePath
 
 ALL_NODES = "SNRMJAX_NODES"
-# Extra modes: of a structure that floats, with six rigid motions, an elastic one is among them.
+# Extra modes: a free structure has six rigid-body modes before the first elastic one.
 _MORE_MODES = 6
-# Eigenvalues of rigid motions are round-off of the stiffness: this far below the last one asked.
+# Rigid-body eigenvalues are round-off of the stiffness: relative to the largest one computed.
 _RIGID_RATIO = 1e-7
-# Held nodes of beams and shells move by the round-off of their constraints: this much of the mode.
-_HELD = 1e-10
-# How much of a mode's inertia nodal translations must carry (1: all of it).
+# Fixed nodes of beams and shells move by the round-off of their constraints: relative amplitude.
+_FIXED = 1e-10
+# Fraction of a mode's inertia that nodal translations must carry.
 _LEAST_CARRIED = 0.9
 
 
@@ -28,15 +28,15 @@ class DeckModes(eqx.Module):
     """Modes of a deck: the basis of a reduced model, in degrees of freedom x, y, z of each node.
 
     Degree of freedom 3 i + d is the translation in direction d of `deck.nodes[i]`. `carried` is
-    how much of each mode's inertia the translations of nodes carry: one but for rotary inertia and
-    the distortion of a section.
+    the fraction of each mode's inertia that nodal translations carry: one except for rotary inertia
+    and the distortion of a section.
     """
 
     basis: ReductionBasis
     deck: Deck
     carried: Float[np.ndarray, " mode"] = eqx.field(converter=np.asarray)
     residual_flexibility: Float[np.ndarray, "mode mode"] = eqx.field(converter=np.asarray)  # s²
-    seconds: float = 0.0  # that CalculiX took
+    seconds: float = 0.0  # run time of CalculiX
 
     def modal_displacement(
         self,
@@ -45,11 +45,11 @@ class DeckModes(eqx.Module):
     ) -> Float[np.ndarray, "case mode"]:
         """Modal coordinates q of static displacements (m) under modal forces f.
 
-        q = G ᵀu − (GᵀK⁻¹G − ω⁻²) f: what nodal loads add to the inertia's (on the section of a
-        beam they act at its middle) gives way locally, which is no motion of the mode.
+        q = G ᵀu − (GᵀK⁻¹G − ω⁻²) f: the local compliance under nodal
+        loads (on a beam they act at the centre of its section) is no motion of the mode.
         """
-        seen: Float[np.ndarray, "case mode"] = displacement @ np.asarray(self.basis.filter).T
-        return seen - force @ self.residual_flexibility
+        projected: Float[np.ndarray, "case mode"] = displacement @ np.asarray(self.basis.filter).T
+        return projected - force @ self.residual_flexibility
 
     def shape_at(self, node: int, direction: int | str) -> Float[np.ndarray, " mode"]:
         """Mass-normalised shapes (kg^-1/2) at a node in direction 0, 1, 2 or "x", "y", "z"."""
@@ -68,20 +68,20 @@ class ModeSurvey(eqx.Module):
     frequency: Float[np.ndarray, " mode"] = eqx.field(converter=np.asarray)  # rad/s
     shapes: Float[np.ndarray, "dof mode"] = eqx.field(converter=np.asarray)  # kg^-1/2
     momenta: Float[np.ndarray, "dof mode"] = eqx.field(converter=np.asarray)  # M Φ, kg^1/2
-    seconds: float  # that CalculiX took
+    seconds: float  # run time of CalculiX
 
     @property
     def carried(self) -> Float[np.ndarray, " mode"]:
-        """How much of each mode's inertia the translations of nodes carry, from zero to one."""
+        """Fraction of each mode's inertia that nodal translations carry."""
         return np.sum(self.shapes * self.momenta, axis=0)
 
     @property
     def effective_mass(self) -> Float[np.ndarray, "mode 3"]:
-        """Of rigid translations in x, y and z (kg): which way a mode moves."""
+        """Effective mass (kg) in x, y and z, which shows a mode's direction of motion."""
         return self.momenta.reshape(-1, 3, len(self.frequency)).sum(axis=0).T ** 2
 
     def only(self, kept: Sequence[int]) -> "ModeSurvey":
-        """Some of the modes, by place from zero."""
+        """Some of the modes, by index from zero."""
         rows = list(kept)
         return ModeSurvey(
             self.frequency[rows], self.shapes[:, rows], self.momenta[:, rows], self.seconds
@@ -96,13 +96,13 @@ def survey_modes(
     program: str = "ccx",
     time_limit: float = 3600.0,
 ) -> ModeSurvey:
-    """The first modes of a deck by CalculiX, whatever they are, to choose from.
+    """The first modes of a deck by CalculiX, to choose from.
 
-    Arguments and errors as `modes_of_deck`, but for modes that nodal translations do not carry.
+    Arguments and errors as `modes_of_deck`; modes that nodal translations do not carry are kept.
     Returns a `ModeSurvey` of `count` modes.
     """
     (count,) = _checked([count])
-    return _survey(deck, count, folder, found_calculix(program, time_limit))
+    return _survey(deck, count, folder, find_calculix(program, time_limit))
 
 
 def modes_of_deck(
@@ -116,20 +116,20 @@ def modes_of_deck(
     """Modes of a deck by CalculiX, with M Φ from its nodal forces.
 
     CalculiX prints the internal forces of a mode, KΦ = ω²MΦ, at the nodes of the deck, for beams
-    and shells as resultants over the solids that they are inside. R = KΦ/ω² is M Φ without a mass
+    and shells as resultants over their expanded solids. R = KΦ/ω² is M Φ without a mass
     matrix, for any element, point masses and consistent masses included. Load cases and filter
-    share G = R (ΦᵀR)⁻¹: ΦᵀG = I holds to round-off, so that loads and modal coordinates stay
+    both use G = R (ΦᵀR)⁻¹: ΦᵀG = I holds to round-off, so that loads and modal coordinates stay
     conjugate. For solids ΦᵀR = I already; for beams and shells it lacks the rotary inertia of the
     section, some 1e-5 to 1e-2 (`carried`).
 
     Arguments: `deck`; `numbers` of the modes to keep, from one; `folder` for its files; `program`
     and its `time_limit` (s). Returns `DeckModes`, largest translation of each mode positive.
     Raises `ValueError` where CalculiX is missing, killed or refuses the deck, where a mode is rigid
-    (a mechanism) or does not exist, and for a mode that nodal translations do not carry, as the
+    (a mechanism) or does not exist, and for a mode that nodal translations do not carry, such as
     torsion of a beam.
     """
     wanted = _checked(numbers)
-    calculix = found_calculix(program, time_limit)
+    calculix = find_calculix(program, time_limit)
     survey = _survey(deck, max(wanted), folder, calculix)
     kept = [number - 1 for number in wanted]
     survey = survey.only(kept)
@@ -139,8 +139,8 @@ def modes_of_deck(
     outcome = run_job(calculix, model, _linear_steps(deck, conjugate))
     tables = list(printed_tables(outcome.dat, deck.nodes)) if outcome.finished else []
     if outcome.error or len(tables) != len(kept):
-        said = outcome.error or "a load case is missing"
-        raise ValueError(f"CalculiX gave no linear static load cases of {deck.name}: {said}.")
+        reason = outcome.error or "a load case is missing"
+        raise ValueError(f"CalculiX gave no linear static load cases of {deck.name}: {reason}.")
     flexibility = conjugate @ np.array([table.values.ravel() for table in tables]).T
     return DeckModes(
         ReductionBasis(
@@ -164,8 +164,8 @@ def _survey(deck: Deck, count: int, folder: FilePath, calculix: Calculix) -> Mod
     shapes = [t.values.ravel() for t in tables if t.quantity == "displacements"]
     forces = [t.values.ravel() for t in tables if t.quantity == "forces"]
     if outcome.error or not shapes or len(shapes) != len(forces):
-        said = outcome.error or "it printed no modes"
-        raise ValueError(f"CalculiX gave no modes of {deck.name}: {said}.")
+        reason = outcome.error or "it printed no modes"
+        raise ValueError(f"CalculiX gave no modes of {deck.name}: {reason}.")
     if len(shapes) < count:
         raise ValueError(
             f"mode {count} of {deck.name} was asked for, but CalculiX found {len(shapes)}."
@@ -180,7 +180,7 @@ def _survey(deck: Deck, count: int, folder: FilePath, calculix: Calculix) -> Mod
 
 
 def all_nodes(deck: Deck) -> str:
-    """A set of all nodes of elements, for what is printed."""
+    """A set of all nodes of elements, for the printed output."""
     rows = [deck.nodes[i : i + 8] for i in range(0, len(deck.nodes), 8)]
     return "\n".join(
         [f"*NSET, NSET={ALL_NODES}", *(", ".join(map(str, row)) + "," for row in rows), ""]
@@ -188,7 +188,7 @@ def all_nodes(deck: Deck) -> str:
 
 
 def load_rows(deck: Deck, loads: Float[np.ndarray, " dof"]) -> list[str]:
-    """Nodal forces (N) as a deck has them."""
+    """Nodal forces (N) as lines of a deck."""
     table = loads.reshape(-1, 3)
     rows = [
         f"{label}, {direction + 1}, {table[node, direction]:.12e}"
@@ -227,11 +227,11 @@ def _signed(
     momenta: Float[np.ndarray, "dof mode"],
     seconds: float,
 ) -> ModeSurvey:
-    """Modes with their largest translation positive, without the reactions of held nodes."""
+    """Modes with their largest translation positive, without the reactions of fixed nodes."""
     heights = np.abs(shapes).max(axis=0)
-    held = np.all(np.abs(shapes) <= _HELD * heights, axis=1, keepdims=True)
-    momenta = np.where(held, 0.0, momenta)
-    # Of two peaks that are equal but for round-off the first decides the sign.
+    fixed = np.all(np.abs(shapes) <= _FIXED * heights, axis=1, keepdims=True)
+    momenta = np.where(fixed, 0.0, momenta)
+    # Where two peaks are equal to round-off, the first sets the sign.
     peaks = np.argmax(np.abs(shapes) > 0.999 * heights, axis=0)
     signs = np.sign(shapes[peaks, np.arange(shapes.shape[1])])
     return ModeSurvey(frequency, shapes * signs, momenta * signs, seconds)
@@ -242,16 +242,16 @@ def _check_rigid(deck: Deck, squares: Float[np.ndarray, " mode"]) -> None:
     if rigid:
         raise ValueError(
             f"{deck.name} has {rigid} mode{'s' if rigid > 1 else ''} without stiffness among its "
-            f"first {len(squares)}: the structure is a mechanism or not held; add "
+            f"first {len(squares)}: the structure is a mechanism or not supported; add "
             "supports (*BOUNDARY)."
         )
 
 
 def _check_carried(deck: Deck, wanted: tuple[int, ...], carried: np.ndarray) -> None:
-    for number, part in zip(wanted, carried, strict=True):
-        if not part >= _LEAST_CARRIED:
+    for number, fraction in zip(wanted, carried, strict=True):
+        if not fraction >= _LEAST_CARRIED:
             raise ValueError(
                 f"mode {number} of {deck.name} moves its nodes too little: their translations "
-                f"carry {100 * part:.0f} % of its inertia (torsion of a beam?); leave it out or "
-                "model it with shells or solids."
+                f"carry {100 * fraction:.0f} % of its inertia (torsion of a beam?); leave it out "
+                "or model it with shells or solids."
             )

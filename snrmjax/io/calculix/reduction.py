@@ -1,4 +1,4 @@
-"""A CalculiX deck as what a reduced-order model is made from."""
+"""A CalculiX deck as the source of a reduced-order model."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from snrmjax.io.calculix.static import STEP_OF_CASES, run_static_cases
 from snrmjax.io.files import FilePath
 from snrmjax.numerics.facts import Fact
 
-Place = tuple[int, str]
+NodeDirection = tuple[int, str]
 """A node's number and a direction, "x", "y" or "z"."""
 
 
@@ -23,43 +23,43 @@ def read_deck_source(
     numbers: Sequence[int],
     folder: FilePath | None = None,
     *,
-    sensors: Mapping[str, Place] | None = None,
-    force: Place | None = None,
+    sensors: Mapping[str, NodeDirection] | None = None,
+    force: NodeDirection | None = None,
     program: str = "ccx",
     time_limit: float = 3600.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> ReductionSource:
     """Read a deck, compute its modes and prepare its load cases, all by CalculiX.
 
-    Jobs and their results live in `folder` (`<deck>.jobs` beside the deck) and serve later runs of
-    the same deck, whatever its modes and loads.
+    Jobs and their results are kept in `folder` (`<deck>.jobs` next to the deck) and reused by later
+    runs of the same deck with any modes and loads.
 
     Arguments: `path` of the deck; `numbers` of the modes to keep, from one; `sensors` by name and
-    `force` (one newton) as (node, direction): where nothing is said, both are where the first mode
+    `force` (one newton) as (node, direction): by default both are where the first mode
     is largest; `program`, `time_limit` (s) and `progress` as for `run_static_cases`.
-    Raises `ValueError` as `read_deck` and `modes_of_deck` do, and leaves no folder behind then.
+    Raises `ValueError` as `read_deck` and `modes_of_deck` do, and then leaves no folder behind.
     """
     deck = read_deck(path)
-    place = Path(path).with_suffix(".jobs") if folder is None else Path(folder)
+    job_folder = Path(path).with_suffix(".jobs") if folder is None else Path(folder)
     try:
-        modes = modes_of_deck(deck, numbers, place, program=program, time_limit=time_limit)
+        modes = modes_of_deck(deck, numbers, job_folder, program=program, time_limit=time_limit)
     except ValueError:
-        _remove_unused(place)
+        _remove_unused(job_folder)
         raise
     largest = _largest(modes)
-    where = dict(sensors) if sensors else {f"node {largest[0]} {largest[1]}": largest}
+    positions = dict(sensors) if sensors else {f"node {largest[0]} {largest[1]}": largest}
     drive = force or largest
 
     def solve(forces: Float[np.ndarray, "case mode"]) -> StaticCases:
         return run_static_cases(
-            modes, forces, place, time_limit=time_limit, program=program, progress=progress
+            modes, forces, job_folder, time_limit=time_limit, program=program, progress=progress
         ).cases
 
     return ReductionSource(
         name=Path(path).stem,
         basis=modes.basis,
         damping_ratio=np.full(len(modes.basis.numbers), ASSUMED_DAMPING),
-        sensors={name: modes.shape_at(*at) for name, at in where.items()},
+        sensors={name: modes.shape_at(*at) for name, at in positions.items()},
         participation=modes.shape_at(*drive),
         solve=solve,
         thickness=deck.thickness,
@@ -68,7 +68,7 @@ def read_deck_source(
     )
 
 
-def _notes(deck: Deck, drive: Place, *, forced: bool) -> tuple[Fact, ...]:
+def _notes(deck: Deck, drive: NodeDirection, *, forced: bool) -> tuple[Fact, ...]:
     notes = [Fact("damping_assumed", ratio=ASSUMED_DAMPING)]
     if not forced:
         notes.append(Fact("driven_at_largest", node=drive[0], direction=drive[1]))
@@ -79,29 +79,29 @@ def _notes(deck: Deck, drive: Place, *, forced: bool) -> tuple[Fact, ...]:
     return tuple(notes)
 
 
-def _largest(modes: DeckModes) -> Place:
-    """Where the first mode that is kept moves most."""
+def _largest(modes: DeckModes) -> NodeDirection:
+    """Node and direction of the largest displacement of the first mode kept."""
     first = np.asarray(modes.basis.shapes)[:, 0]
     node, direction = divmod(int(np.argmax(np.abs(first))), 3)
     return int(modes.deck.nodes[node]), "xyz"[direction]
 
 
 def _lines(modes: DeckModes) -> ShapeLines | None:
-    """Shapes along a structure of beam elements, which has a line to draw them over."""
+    """Shapes along the axis of a structure of beam elements; None for other elements."""
     if not all(kind.startswith("B") for kind in modes.deck.element_types):
         return None
-    places = modes.deck.coordinates
-    along = int(np.argmax(np.ptp(places, axis=0)))
-    order = np.argsort(places[:, along])
+    coordinates = modes.deck.coordinates
+    along = int(np.argmax(np.ptp(coordinates, axis=0)))
+    order = np.argsort(coordinates[:, along])
     across = "xyz".index(_largest(modes)[1])
     shape = np.asarray(modes.basis.shapes)[across::3][order]
-    return ShapeLines(places[order, along], shape, f"Position along {'xyz'[along]} (m)")
+    return ShapeLines(coordinates[order, along], shape, f"Position along {'xyz'[along]} (m)")
 
 
-def _remove_unused(place: Path) -> None:
-    """Remove a folder of jobs in which there is no result yet."""
-    if place.is_dir() and not any(place.glob("case-*")):
-        for model in place.glob("model-*.inp"):
+def _remove_unused(job_folder: Path) -> None:
+    """Remove a folder of jobs without any result."""
+    if job_folder.is_dir() and not any(job_folder.glob("case-*")):
+        for model in job_folder.glob("model-*.inp"):
             model.unlink()
-        if not any(place.iterdir()):
-            place.rmdir()
+        if not any(job_folder.iterdir()):
+            job_folder.rmdir()

@@ -1,4 +1,4 @@
-"""What CalculiX writes: eigenvalues, printed displacements and forces, energies, its errors."""
+"""Output of CalculiX: eigenvalues, printed displacements and forces, energies, errors."""
 
 import re
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ _HEADER = re.compile(
 )
 _ENERGY = re.compile(r"total internal energy .* and time\s+(\S+)\s*$", re.MULTILINE)
 _EIGENVALUE = re.compile(r"^\s*(\d+)\s+(\S+)\s+(\S+)\s+(\S+)\s+(\S+)\s*$")
-_E_DROPPED = re.compile(r"(\d)([+-]\d{3})$")  # how Fortran prints exponents of three digits
+_E_DROPPED = re.compile(r"(\d)([+-]\d{3})$")  # Fortran drops the E of three-digit exponents
 _ERROR = re.compile(r"\*ERROR[^\n]*(?:\n(?!\s*\n|\s*\*)[^\n]*)*")
 
 
@@ -27,7 +27,7 @@ class PrintedTable(NamedTuple):
 def printed_tables(text: str, nodes: Int[np.ndarray, " node"]) -> Iterator[PrintedTable]:
     """Tables of displacements and forces in a `.dat` file, rows in the order of `nodes`.
 
-    Raises `ValueError` where a table does not have each node once or a number is damaged.
+    Raises `ValueError` where a table does not have each node once or a number is malformed.
     """
     heads = list(_HEADER.finditer(text))
     for head in heads:
@@ -41,7 +41,8 @@ def printed_tables(text: str, nodes: Int[np.ndarray, " node"]) -> Iterator[Print
         order = np.argsort(table[:, 0])
         if not np.array_equal(table[order, 0], nodes):
             raise ValueError(
-                f"a table of {head[1]} has {len(table)} rows for {len(nodes)} nodes: it is cut off."
+                f"a table of {head[1]} has {len(table)} rows for {len(nodes)} nodes: "
+                "it is incomplete."
             )
         yield PrintedTable(head[1], float(head[2]), table[order, 1:])
 

@@ -1,1 +1,1 @@
-"""Between laboratories' files and our tables: what a file holds, maps, imports and exports."""
+"""Import of laboratory files into our tables: listings, maps, imports and exports."""

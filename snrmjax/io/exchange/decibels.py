@@ -1,4 +1,4 @@
-"""Columns of levels in decibels as the amplitudes that they mean."""
+"""Conversion of columns in decibels to amplitudes."""
 
 import numpy as np
 from jaxtyping import Float
@@ -12,12 +12,12 @@ from snrmjax.numerics.facts import Fact
 def with_stated_references(
     table: NumberTable, mapping: ImportMap, file: str
 ) -> tuple[NumberTable, ImportMap, list[Fact]]:
-    """A table whose levels are amplitudes, a map with the units of these, and notes.
+    """A table with levels converted to amplitudes, a map with their units, and notes.
 
-    A level L re R is the amplitude R·10^(L/20). References are those that the file states, or what
-    the map states in place of a unit, as "dB re 1e-9 m/s", which wins.
-    Raises `ValueError` for a level without a reference that the map takes for an amplitude, and for
-    one that the map states of a column in another unit.
+    A level L re R is the amplitude R·10^(L/20). The reference is that of the file, or one
+    stated by the map in place of a unit, as "dB re 1e-9 m/s", which takes precedence.
+    Raises `ValueError` for a level used as an amplitude without a reference, and for a reference
+    stated for a column that is not in dB.
     """
     responses, stated = [], dict[str, str]()
     imaginary = [one.channel for one in mapping.responses if one.imaginary]
@@ -57,7 +57,7 @@ def with_stated_references(
             )
         if np.iscomplexobj(values) or name in imaginary:
             raise ValueError(
-                f"{name} of {file} has real and imaginary parts, and is no level in "
+                f"{name} of {file} has real and imaginary parts, so it cannot be a level in "
                 f"{unit_of_map or unit_of_file}."
             )
         columns[name] = amplitude_of_level(values)
@@ -72,7 +72,7 @@ def with_stated_references(
 
 
 def amplitude_of_level(level: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
-    """Amplitudes over the reference of levels in dB.
+    """Amplitude ratios to the reference, from levels in dB.
 
     >>> amplitude_of_level(np.array([20.0, -40.0])).tolist()
     [10.0, 0.01]

@@ -1,4 +1,4 @@
-"""Writing what an import gives: steady states, records as CSV or netCDF 4, and the map."""
+"""Writing imported data: steady states, records as CSV or netCDF 4, and the map."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,20 +13,20 @@ from snrmjax.io.laboratory.libraries import library
 from snrmjax.io.tables import write_steady_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 
-_MOST_ROWS = 2**20  # of a record that is written as text
-_BLOCK = 2**20  # samples of all channels that are written at once
-_PIECE = 2**15  # numbers of a piece of the file
+_MOST_ROWS = 2**20  # values of a record written as text, at most
+_BLOCK = 2**20  # samples of all channels written at once
+_CHUNK = 2**15  # numbers in a chunk of the file
 
 
 def write_netcdf(path: FilePath, record: TimeRecording) -> None:
-    """Write a record as netCDF 4 in SI units, block by block: it need not fit into memory.
+    """Write a record as netCDF 4 in SI units, block by block, so that it need not fit into memory.
 
-    It has `sampling_rate_hz`, `start_time_s`, `channels` and what is known of them, and `values`,
-    one row a channel. `read_laboratory_file` gives all numbers back bit for bit.
+    Variables: `sampling_rate_hz`, `start_time_s`, `channels` with their metadata, and `values`,
+    one row a channel. `read_laboratory_file` restores all numbers bit for bit.
     """
     h5netcdf, h5py = library("h5netcdf", "writing netCDF"), library("h5py", "writing netCDF")
     width = len(record.channels)
-    words = {
+    texts_by_name = {
         "channels": record.channel_names,
         "quantity": [channel.quantity for channel in record.channels],
         "unit": [channel.si_unit for channel in record.channels],
@@ -38,11 +38,11 @@ def write_netcdf(path: FilePath, record: TimeRecording) -> None:
         target.dimensions.update({"channel": width, "sample": record.n_samples})
         for name, number in numbers.items():
             target.create_variable(name, (), dtype="<f8")[...] = number
-        for name, texts in words.items():
+        for name, texts in texts_by_name.items():
             column = target.create_variable(name, ("channel",), dtype=h5py.string_dtype())
             column[...] = np.array(texts, dtype=object)
-        piece = (width, max(1, min(record.n_samples, _PIECE // width)))
-        values = target.create_variable("values", ("channel", "sample"), dtype="<f8", chunks=piece)
+        chunk = (width, max(1, min(record.n_samples, _CHUNK // width)))
+        values = target.create_variable("values", ("channel", "sample"), dtype="<f8", chunks=chunk)
         for block in record.blocks(max(1, _BLOCK // width)):
             values[:, block.start : block.start + block.values.shape[1]] = block.values
 
@@ -51,7 +51,7 @@ def write_import(folder: Path, imported: Imported, files: Sequence[str] = ()) ->
     """Write `measured.csv` (or `record.csv`, `record_2.csv`, …, or `.nc` of long ones), `map.toml`.
 
     Records have the columns `time_s`, `force_n` or `drive_v`, and one motion a sensor
-    (`tip.velocity_m_s`), in SI units. The map says of which `files` all is.
+    (`tip.velocity_m_s`), in SI units. The map lists the imported `files`.
     Returns the names of the files.
     """
     written = []

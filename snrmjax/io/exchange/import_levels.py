@@ -1,4 +1,4 @@
-"""What number of level each imported state gets."""
+"""Level numbers of imported states."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,24 +12,24 @@ from snrmjax.numerics.facts import Fact
 
 
 class MeasuredPart(NamedTuple):
-    """Steady states of one file, before they have levels; phasors relative to the force."""
+    """Steady states of one file before levels are numbered; phasors relative to the force."""
 
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N or V
     velocity: Complex[np.ndarray, "state sensor"]  # m/s
-    key: Float[np.ndarray, " state"] | None  # what a column or the order says of levels
-    velocity_std: Float[np.ndarray, "state sensor"]  # m/s; NaN where nobody states it
+    key: Float[np.ndarray, " state"] | None  # level keys from a column or the order
+    velocity_std: Float[np.ndarray, "state sensor"]  # m/s; NaN where not stated
     phase_std: Float[np.ndarray, "state sensor"]  # rad
 
 
 def numbered_levels(
     parts: Sequence[MeasuredPart], level: str, assumed: Assumptions
 ) -> tuple[np.ndarray, str]:
-    """The level of every state of all parts, and the rule that was used, for the map.
+    """The level of every state of all parts, and the rule used, for the map.
 
-    Arguments: `level` is the rule that was stated; without one, a column or the order that the
-    file has, then one level a file, then groups of the force.
-    Raises `ValueError` for a rule that the data do not have.
+    Arguments: `level` is the stated rule; without one, a column or the order in the file, then
+    one level a file, then groups of equal force.
+    Raises `ValueError` for a rule that does not apply to the data.
     """
     lengths = [len(part.frequency) for part in parts]
     files = np.repeat(np.arange(1, len(parts) + 1), lengths)
@@ -40,9 +40,9 @@ def numbered_levels(
         keys = np.concatenate([np.full(0, 0.0) if p.key is None else p.key for p in parts])
         if not keyed:
             raise ValueError(
-                f"--level {level} is nothing that this file has: force, runs, file, or a column."
+                f"--level {level} does not exist in this file: give force, runs, file, or a column."
             )
-        if len(parts) > 1:  # a key of each file for itself
+        if len(parts) > 1:  # separate keys for each file
             keys = np.unique(np.stack([files, keys]), axis=1, return_inverse=True)[1] + 1.0
         whole = np.all(keys == np.round(keys)) and np.all(np.abs(keys) < 1e9)
         if whole:

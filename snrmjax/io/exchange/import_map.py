@@ -1,4 +1,4 @@
-"""The map of an import: which channel or column is what, as options and as `map.toml`."""
+"""The map of an import: meaning of channels and columns, as options and as `map.toml`."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -26,19 +26,19 @@ _CHANNELS, _NUMBERS, _TEXTS = "Channels and columns", "What the numbers are", "T
 
 
 BY_NAME = "name"
-"""The word for amplitudes that file names state."""
+"""Keyword for amplitudes stated by file names."""
 
 
 class MapKey(NamedTuple):
-    """A key of a map and an option of an import: what it means, and the words it may have."""
+    """A key of a map and option of an import: its meaning and choices."""
 
     meaning: str
     metavar: str = "NAME"
-    group: str | None = _CHANNELS  # None: what most imports state
+    group: str | None = _CHANNELS  # None: options that most imports need
     choices: tuple[str, ...] = ()
 
 
-# What a time record may be: the last two are written as records, not as steady states.
+# Kinds of time records: the last two are written as records, not as steady states.
 _RECORDS = ("steps", "sweep", "decay", "broadband")
 
 KEYS = {
@@ -54,9 +54,7 @@ KEYS = {
         "first frequency in Hz of responses without frequencies", "HZ", _NUMBERS
     ),
     "frequency_step": MapKey("step of their frequencies in Hz; 0: the file's", "HZ", _NUMBERS),
-    "force": MapKey(
-        "channel or column of the force (or of the voltage that drives it)", group=None
-    ),
+    "force": MapKey("channel or column of the force (or of the drive voltage)", group=None),
     "force_unit": MapKey(
         "unit of the force: N, lbf, …; V: known as a drive voltage only", "UNIT", None
     ),
@@ -77,11 +75,13 @@ KEYS = {
         *("SIGN", _NUMBERS, ("lead", "lag")),
     ),
     "amplitude": MapKey(
-        "size of the amplitudes: peak, rms or peak_to_peak",
+        "kind of the amplitudes: peak, rms or peak_to_peak",
         *("SIZE", _NUMBERS, ("peak", "rms", "peak_to_peak")),
     ),
-    "level": MapKey("what numbers levels: a column, or file, force, drive, runs, z, order", "RULE"),
-    "drive": MapKey("channel of the generator's voltage, by which steps are recognised"),
+    "level": MapKey(
+        "rule that numbers the levels: a column, or file, force, drive, runs, z, order", "RULE"
+    ),
+    "drive": MapKey("channel of the generator voltage, used to detect steps"),
     "separator": MapKey(
         "separator of columns: comma, semicolon, tab or space; empty: found",
         *("NAME", _TEXTS, ("comma", "semicolon", "tab", "space")),
@@ -91,20 +91,20 @@ KEYS = {
     ),
     "header_row": MapKey("row of a text's names, from 1; 0: found", "ROW", _TEXTS),
 }
-"""Of the whole test, in the order of the map."""
+"""Keys of the whole test, in the order of the map."""
 
 RESPONSE_KEYS = {
     "sensor": MapKey("name of the sensor as the model has it"),
     "phase": MapKey("column of the phase", group=None),
     "imaginary": MapKey("column of the imaginary part (lock-in Y)"),
-    "amplitude_std": MapKey("column of the amplitude's 1σ (default: by name, as R_std beside R)"),
+    "amplitude_std": MapKey("column of the amplitude's 1σ (default: by name, as R_std next to R)"),
     "phase_std": MapKey("column of the phase's 1σ, in its unit (default: by name)"),
 }
-"""Of each response; options have them in the order of the responses."""
+"""Keys of each response; options take them in the order of the responses."""
 
 
 class Assumption(NamedTuple):
-    """Why something was taken that nobody stated, and its value where the map has none yet."""
+    """Reason of an assumption, and its value where the map has none yet."""
 
     why: Fact
     value: str = ""
@@ -114,14 +114,14 @@ class Assumption(NamedTuple):
 
 
 class Assumptions(dict[str, Assumption]):
-    """What was taken for each key of the map that nobody stated, and why."""
+    """Assumptions for keys of the map that were not stated."""
 
     def add(self, key: str, why: Fact, value: str = "") -> None:
         """Record an assumption."""
         self[key] = Assumption(why, value)
 
     def unit(self, key: str, stated: str, file_unit: str) -> None:
-        """Record where a unit comes from: the map wins over the file."""
+        """Record the source of a unit: the map takes precedence over the file."""
         if not stated and file_unit:
             self.add(key, Fact("unit_of_file"), file_unit)
         elif stated and file_unit and stated != file_unit:
@@ -129,7 +129,7 @@ class Assumptions(dict[str, Assumption]):
 
 
 class ResponseMap(NamedTuple):
-    """One response: its channel or column, what it is, where its phase and its errors stand."""
+    """One response: its channel or column, quantity and unit, with columns of phase and errors."""
 
     channel: str
     quantity: str = ""
@@ -142,7 +142,7 @@ class ResponseMap(NamedTuple):
 
 
 class ImportMap(NamedTuple):
-    """All that an import is told; what is empty is found or assumed; see `map_text`."""
+    """All options of an import; empty ones are detected or assumed; see `map_text`."""
 
     responses: tuple[ResponseMap, ...] = ()
     dataset: str = ""
@@ -170,7 +170,7 @@ class ImportMap(NamedTuple):
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing is said of channels."""
+        """Whether no channel or column is stated."""
         plain = self._replace(separator="", decimal="", header_row=0, dataset="", rate=0.0)
         return plain._replace(frequency_start=0.0, frequency_step=0.0) == ImportMap()
 
@@ -181,13 +181,13 @@ class ImportMap(NamedTuple):
 
     @property
     def base_channel(self) -> str:
-        """The channel or column of a base's motion, if no numbers and no file names state it."""
+        """The channel or column of a base's motion, unless numbers or file names state it."""
         name = self.base_motion.channel if self.base else ""
         return "" if self.base_amplitudes or name == BY_NAME else name
 
     @property
     def base_amplitudes(self) -> tuple[float, ...]:
-        """The amplitudes of a base that are stated as numbers, in the unit that is stated."""
+        """Amplitudes of the base motion stated as numbers, in the stated unit."""
         try:
             return tuple(float(word) for word in self.base_motion.channel.split(","))
         except ValueError:
@@ -195,23 +195,23 @@ class ImportMap(NamedTuple):
 
     @property
     def load(self) -> str:
-        """The channel or column that drives the structure: of the force or of the base's motion."""
+        """The channel or column of the excitation: the force or the base motion."""
         return self.base_channel or self.force
 
     def with_names(self, units: Mapping[str, str]) -> "ImportMap":
-        """With channels and columns named as a list has them that names may have as in the file.
+        """With channels and columns named as in the listing, where the map has the file's names.
 
-        Arguments: `units` has the names that are listed, with the unit of each or "".
+        Arguments: `units` of the listed names, "" where unknown.
         Raises `ValueError` for a response's word that is neither a name nor a name with a motion.
         """
         responses = []
         for response in self.responses:
             whole = ":".join(filter(None, (response.channel, response.quantity)))
-            if whole in units and response.channel not in units:  # of a name with a colon
+            if whole in units and response.channel not in units:  # the name contains a colon
                 response = response._replace(channel=whole, quantity="")
-            places = {key: listed_name(getattr(response, key), units) for key in _OF_RESPONSE}
-            responses.append(response._replace(**places))
-            name = places["channel"]
+            resolved = {key: listed_name(getattr(response, key), units) for key in _OF_RESPONSE}
+            responses.append(response._replace(**resolved))
+            name = resolved["channel"]
             if name not in units and ":" in name and name.rsplit(":", 1)[1].isalpha():
                 raise ValueError(
                     f"--response must be a channel and one of {', '.join(_MOTIONS)}, as "
@@ -223,14 +223,14 @@ class ImportMap(NamedTuple):
 
     @property
     def even_axis(self) -> "EvenAxis | None":
-        """The frequencies of responses without any, if they are stated."""
+        """Stated frequencies of responses without a frequency axis, or None."""
         from snrmjax.io.laboratory.arrays.even_axis import axis_of_options
 
         return axis_of_options(self.frequency_start, self.frequency_step)
 
     @property
     def text_format(self) -> "TextFormat":
-        """How texts are written."""
+        """Format of text files."""
         from snrmjax.io.laboratory.contents import TextFormat
 
         return TextFormat(self.separator or None, self.decimal or None, self.header_row or None)
@@ -251,12 +251,12 @@ def response_word(word: str, unit: str = "") -> ResponseMap:
 
 
 def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap:
-    """The map that options and a file state; options win.
+    """The map from options and a file; options take precedence.
 
     Arguments: `given` has the options by the keys of a map, `response` as for `response_word`;
-    what is empty was not given.
-    Raises `ValueError` that names the option for words that are none of its choices, and for
-    sensors and phases of another number than responses.
+    empty ones were not given.
+    Raises `ValueError` that names the option for an invalid choice, and where the number of sensors
+    or phases differs from that of the responses.
     """
     words = {key: given[key] for key in KEYS if given.get(key)}
     for key, word in words.items():
@@ -272,13 +272,13 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
         _require_base(words["base"])
     if "rate" in words and not 0 < words["rate"] < float("inf"):
         raise ValueError(f"--rate must be above zero, but is {words['rate']:g} Hz.")
-    told = ImportMap() if map_file is None else read_import_map(map_file)
+    base_map = ImportMap() if map_file is None else read_import_map(map_file)
     unit, response = words.pop("unit", ""), given.get("response") or ()
-    responses = tuple(response_word(word, unit) for word in response) or told.responses
+    responses = tuple(response_word(word, unit) for word in response) or base_map.responses
     stated = [word for word in response if response_word(word).unit]
     if unit and stated:
         raise ValueError(
-            f"--unit {unit} is of responses whose unit is not stated, but --response {stated[0]} "
+            f"--unit {unit} is for responses without a stated unit, but --response {stated[0]} "
             "states one: leave one of the two out."
         )
     if unit and not response:
@@ -301,22 +301,22 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
         doubled = [name for name in listed if listed.count(name) > 1]
         if doubled:
             raise ValueError(f"{what} names {doubled[0]!r} twice.")
-    if unit and not responses:  # of our own table, which has no responses to be named
+    if unit and not responses:  # our own table has no responses to name
         words["unit"] = unit
-    # Another way to drive the structure takes the place of the one that the map file has.
+    # Another excitation replaces the one of the map file.
     driven = {"force", "base"}.intersection(words)
     dropped = {"force": ("base",), "base": ("force", "force_unit", "force_amplitude")}
-    gone = {key: ImportMap._field_defaults[key] for one in driven for key in dropped[one]}
-    return told._replace(**{**gone, **words}, responses=responses)
+    cleared = {key: ImportMap._field_defaults[key] for one in driven for key in dropped[one]}
+    return base_map._replace(**{**cleared, **words}, responses=responses)
 
 
 def _require_base(word: str) -> None:
-    """Raise `ValueError` for a base's motion without a quantity, or of a number that is none."""
+    """Raise `ValueError` for a base motion without quantity or with an invalid amplitude."""
     stated = response_word(word)
     numbers = ImportMap(base=word).base_amplitudes
     if not stated.quantity or (numbers and not stated.unit):
         raise ValueError(
-            f"--base must say which motion it is, as CH1:acceleration:g or 0.5:acceleration:g, but "
+            f"--base must state its quantity, as CH1:acceleration:g or 0.5:acceleration:g, but "
             f"is {shown(word)}."
         )
     if not all(0 < number < float("inf") for number in numbers):
@@ -384,7 +384,7 @@ def _value(table: TomlTable, key: str) -> Any:
 
 
 def steps_of_map(path: FilePath) -> StepCounts | None:
-    """How many steps of the records an import used; None where there were none."""
+    """Numbers of record steps that an import used and left out; None where there were none."""
     file = file_name(path)
     table = parsed_toml(read_text(path), file)
     if "steps" not in table.entries:
@@ -403,14 +403,14 @@ def map_text(
     files: Sequence[str] = (),
     steps: StepCounts | None = None,
 ) -> str:
-    """`map.toml`: every key with its meaning, and what was assumed with the reason.
+    """Text of `map.toml`: every key with its meaning, and the reason of each assumption.
 
-    Arguments: `assumed` has the reason of each key that nobody stated; keys of the k-th response
-    (from 1) as "response 1.unit"; `files` that were read, as seen from the map's folder;
+    Arguments: `assumed` has the reason of each key not stated; keys of the k-th response
+    (from 1) as "response 1.unit"; `files` read, relative to the map's folder;
     `steps` of the records that were used and left out.
     """
     lines = [
-        "# How the laboratory's files were read. Take it for the next test: snrmjax import "
+        "# How the laboratory's files were read. Use it for the next test: snrmjax import "
         "FILE --map map.toml --out DIR",
         *(["# files: " + shlex.join(files)] if files else []),
         *(f"# note: {' '.join(str(note).split())}" for note in notes),
@@ -432,7 +432,7 @@ def map_text(
 
 
 def _comment(key: str, value: object, assumed: Mapping[str, Assumption]) -> str:
-    """Why a value was assumed, and what else it could be; empty for one that was stated."""
+    """Why a value was assumed, and the alternatives; empty for a stated value."""
     if key not in assumed:
         return ""
     assumption = assumed[key]

@@ -1,4 +1,4 @@
-"""Options of an import that nothing would obey: refused, so that no number is silently another."""
+"""Refusal of import options without effect, so that no option is silently ignored."""
 
 from collections.abc import Collection, Sequence
 from typing import Literal
@@ -11,7 +11,7 @@ Content = Literal["own table", "table", "responses", "records"]
 _TEXT = {"separator", "decimal", "header_row"}
 _ANY = {"dataset", "response", "unit", "force_unit", *_TEXT}
 _PHASORS = {*_ANY, "force", "base", "force_amplitude", "phase_sign", "amplitude", "level", "sensor"}
-_OBEYED: dict[Content, set[str]] = {
+_EFFECTIVE: dict[Content, set[str]] = {
     "own table": {"dataset", "unit", "force_unit", "amplitude", "phase_sign", *_TEXT},
     "responses": {*_PHASORS, "frequency_start", "frequency_step"},
     "table": {
@@ -28,26 +28,26 @@ _WHAT: dict[Content, str] = {
     "records": "time records",
 }
 STAYS_RECORD = ("decay", "broadband")
-"""Kinds of time records that an import writes as records, not as steady states."""
+"""Kinds of time records that an import keeps as records."""
 
 
 def refuse_unused(
     stated: Collection[str], content: Content, mapping: ImportMap, file: str, kinds: Collection[str]
 ) -> None:
-    """Raise `ValueError` that names an option which has no effect on what the files hold.
+    """Raise `ValueError` that names an option without effect on the contents of the files.
 
-    Arguments: `stated` are the keys of options of the command line (what a map file has may be of
-    another test); `kinds` those of the files.
+    Arguments: `stated` are the keys of command-line options (a map file may come from another
+    test); `kinds` of the files.
     """
 
     def refuse(key: str, why: str) -> None:
         raise ValueError(f"--{key.replace('_', '-')} has no effect {why}: leave it out.")
 
     for key in stated:
-        if key not in _OBEYED[content]:
+        if key not in _EFFECTIVE[content]:
             refuse(key, f"on {_WHAT[content]}, as {file} holds")
         if key in _TEXT and not {"csv"}.intersection(kinds):
-            refuse(key, f"on {file}, which states itself how it is written")
+            refuse(key, f"on {file}, whose format is fixed")
     for first, second in (
         ("base", "force"),
         ("base", "force_unit"),
@@ -55,11 +55,11 @@ def refuse_unused(
         *((("force", "force_amplitude"),) if content == "table" else ()),
     ):
         if first in stated and second in stated:
-            refuse(second, f"beside --{first}")
+            refuse(second, f"together with --{first}")
     if "force_phase" in stated and not mapping.load:
         refuse("force_phase", "without the column of a force or a base")
     if "force_phase" in stated and mapping.over_force:
-        refuse("force_phase", "beside --over-force: phases are then relative to the force")
+        refuse("force_phase", "together with --over-force: phases are then relative to the force")
     has_force = content == "own table" or mapping.force or mapping.force_amplitude
     if "force_unit" in stated and not has_force:
         refuse("force_unit", "without --force or --force-amplitude")
@@ -70,21 +70,20 @@ def refuse_unused(
 
 
 def refuse_unused_axis(stated: Collection[str], files: Sequence[LaboratoryFile]) -> None:
-    """Raise `ValueError` where frequencies are stated of responses that have their own, or none."""
-    for held in files:
-        is_used = any(note.kind == "even_axis" for note in held.notes)
+    """Raise `ValueError` where frequencies are stated but no response lacks them."""
+    for source in files:
+        is_used = any(note.kind == "even_axis" for note in source.notes)
         if "frequency_step" in stated and not is_used:
             raise ValueError(
-                f"--frequency-step has no effect on {held.name}, which holds no responses without "
+                f"--frequency-step has no effect on {source.name}, which has no responses without "
                 "frequencies: leave it out."
             )
 
 
 def refuse_unused_phase_unit(stated: Collection[str], used: ImportMap) -> None:
-    """Raise `ValueError` where a unit of phases is stated, but no phase was read."""
+    """Raise `ValueError` where a phase unit is stated, but no phase was read."""
     read = bool(used.force_phase) or any(response.phase for response in used.responses)
     if "phase_unit" in stated and not read:
         raise ValueError(
-            "--phase-unit has no effect: no column of phases is read (--phase names one): leave it "
-            "out."
+            "--phase-unit has no effect: no phase column is read (--phase names one): leave it out."
         )

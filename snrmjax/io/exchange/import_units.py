@@ -1,4 +1,4 @@
-"""Units and quantities of an import: stated by the map, by the file, or asked for."""
+"""Units and quantities of an import, from the map or the file."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -10,8 +10,8 @@ from jaxtyping import Complex, Float
 from snrmjax.io.exchange.import_map import Assumptions, ImportMap
 from snrmjax.io.laboratory.physical_units import (
     UnitMeaning,
+    amplitude_kind,
     level_reference,
-    size_of,
     unit_meaning,
 )
 from snrmjax.measure.recordings.channels import DERIVATIVE, SI_UNIT, Quantity
@@ -19,35 +19,35 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
 
 AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
-"""What makes peak amplitudes of peak, rms and peak-to-peak ones."""
+"""Factors to peak amplitude for sinusoidal signals."""
 
 _HERTZ = 2 * np.pi
 
 
 class Force(NamedTuple):
-    """What the numbers of a force are multiplied with, or those of a base's `motion`."""
+    """Conversion of a force, drive voltage or base `motion` to SI."""
 
     factor: float
     is_voltage: bool
     unit: str
-    motion: Quantity | None = None  # of a base, in the place of a force
+    motion: Quantity | None = None  # of a base, in place of a force
 
     @property
     def dimension(self) -> str:
-        """What it is: a force, a voltage, or which motion."""
+        """Force, voltage, or the quantity of the base motion."""
         return self.motion or ("voltage" if self.is_voltage else "force")
 
     def acceleration(
         self, omega: Float[np.ndarray, " row"]
     ) -> Complex[np.ndarray, " row"] | Float[np.ndarray, " row"]:
-        """What makes the acceleration of a base of its phasors; 1 of a force."""
+        """Factor from base-motion phasors to acceleration, (iω)ⁿ; 1 for a force."""
         if self.motion is None:
             return np.ones(len(omega))
         return (1j * omega) ** (2 - DERIVATIVE[self.motion])
 
 
 def require_name(option: str, name: str, known: Iterable[str], what: str, file: str) -> None:
-    """Raise `ValueError` where an option names nothing that a file has; `what` are those there."""
+    """Raise `ValueError` where an option names something that the file lacks; `what` in plural."""
     names = list(known)
     if name not in names:
         near = near_miss(name, names)
@@ -63,20 +63,20 @@ _IN_A_NAME = re.compile(
 
 
 def amplitude_of_name(file: str) -> tuple[float, str] | None:
-    """Amplitude and unit that a file's name states, as 0.4 N of "sine_0.4N_up.txt"; or None.
+    """Amplitude and unit in a file name, as 0.4 N in "sine_0.4N_up.txt"; None without exactly one.
 
     >>> amplitude_of_name("sine_0,4N_up.txt"), amplitude_of_name("run 2.csv")
     ((0.4, 'N'), None)
     """
-    found = {(match[1], match[2]) for match in _IN_A_NAME.finditer(file.rsplit(".", 1)[0])}
-    if len(found) != 1:
+    matches = {(match[1], match[2]) for match in _IN_A_NAME.finditer(file.rsplit(".", 1)[0])}
+    if len(matches) != 1:
         return None
-    number, unit = found.pop()
+    number, unit = matches.pop()
     return float(number.replace(",", ".")), unit.replace("m_s2", "m/s^2")
 
 
 def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
-    """The unit of the force. Raises `ValueError` with a question where nobody states it."""
+    """The unit of the force. Raises `ValueError` with a question where it is not stated."""
     if mapping.force_unit and level_reference(file_unit) is not None:
         raise ValueError(f"{what} is a level in {file_unit}, not in {mapping.force_unit}.")
     unit = mapping.force_unit or file_unit
@@ -84,7 +84,7 @@ def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
         raise ValueError(
             f"in which unit is {what}? State it: --force-unit N (or lbf, V for a drive voltage)."
         )
-    meaning = _understood(unit, "--force-unit")
+    meaning = _meaning(unit, "--force-unit")
     if meaning.dimension not in ("force", "voltage"):
         raise ValueError(
             f"{what} must be a force or a voltage, but its unit {unit} is of {meaning.dimension}: "
@@ -95,9 +95,9 @@ def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
 
 
 def load_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
-    """What the numbers of what drives the structure are: of a force, a voltage or a base's motion.
+    """Quantity and unit of the excitation: a force, a voltage or a base motion.
 
-    Raises `ValueError` with a question where nobody states it.
+    Raises `ValueError` with a question where they are not stated.
     """
     if not mapping.base:
         return force_meaning(mapping, file_unit, what)
@@ -119,8 +119,8 @@ def motion_meaning(
 ) -> tuple[Quantity, float, str]:
     """Quantity, factor into SI and unit of a response.
 
-    Arguments: `over` is the force (or the base's motion) that the response is divided by: by its
-    numbers as they stand, where the unit does not say "m/s/N" or "g/g".
+    Arguments: `over` is the force (or base motion) that the response is divided by, in its own unit
+    unless the response's unit states it, as "m/s/N" or "g/g".
     Raises `ValueError` with a question where they are not stated or contradict one another.
     """
     if unit and level_reference(file_unit) is not None:
@@ -133,30 +133,30 @@ def motion_meaning(
         example = f"{channel}:{of}:{SI_UNIT[of]}"
         others = ", or --unit for all responses" if option == "--response" else ""
         raise ValueError(f"in which unit is {channel}? State it: {option} {example}{others}.")
-    said = _understood_or_none(stated)
-    is_per_force = said is not None and said.per_force
+    stated_meaning = _meaning_or_none(stated)
+    is_per_force = stated_meaning is not None and stated_meaning.per_force
     if is_per_force and (over is None or over.is_voltage or over.motion is not None):
-        way = "say so by --over-force, with the force's own column or amplitude in a unit of force"
+        way = "give --over-force, with the force's column or amplitude in a unit of force"
         if over is not None:
-            way = f"what --over-force has it over is in {over.unit}, no unit of force"
-        raise ValueError(f"{channel} is over a force by its unit {stated}: {way}.")
+            way = f"the divisor of --over-force is in {over.unit}, which is no unit of force"
+        raise ValueError(f"{channel} is a response per force by its unit {stated}: {way}.")
     below = 1.0 if over is None or is_per_force else over.factor
     if over is not None and not is_per_force and "/" in stated:
         numerator, _, divisor = (part.strip("() ") for part in stated.rpartition("/"))
-        under = _understood_or_none(divisor)
-        if under is not None and under.dimension == over.dimension:
-            stated, below = numerator, under.factor
-    meaning = _understood(stated, "--unit")
+        divisor_meaning = _meaning_or_none(divisor)
+        if divisor_meaning is not None and divisor_meaning.dimension == over.dimension:
+            stated, below = numerator, divisor_meaning.factor
+    meaning = _meaning(stated, "--unit")
     if meaning.per_volt:
         raise ValueError(
             f"{stated} of {channel} is a sensitivity: give the unit of the channel's numbers, as "
-            "--unit g, or for volts the motion of a volt, as --unit '9.8 m/s^2'."
+            "--unit g, or for volts the motion per volt, as --unit '9.8 m/s^2'."
         )
     if meaning.dimension not in ("displacement", "velocity", "acceleration"):
         raise ValueError(
             f"{channel} must be a displacement, velocity or acceleration, but its unit {stated} is "
-            f"of {meaning.dimension}: {'give' if unit else '--unit states'} what one of its "
-            "numbers is (a sensor of 100 mV/g: --unit '10 g' per volt)."
+            f"of {meaning.dimension}: {'give' if unit else '--unit states'} the motion that the "
+            "number 1 means (a sensor of 100 mV/g: --unit '10 g' per volt)."
         )
     if quantity and quantity != meaning.dimension:
         raise ValueError(
@@ -167,35 +167,35 @@ def motion_meaning(
 
 
 def amplitude_factor(mapping: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:
-    """What turns amplitudes into peak amplitudes: stated, else by units and names, else peak.
+    """Factor to peak amplitudes: as stated, else by units and names, else 1.
 
     Arguments: `units` of the columns by their names.
     """
-    of_units = {size_of(unit) for unit in units.values()} - {""}
-    said = {size_of(unit) or size_of(name) for name, unit in units.items()}
-    sizes = said - {""}
+    of_units = {amplitude_kind(unit) for unit in units.values()} - {""}
+    all_kinds = {amplitude_kind(unit) or amplitude_kind(name) for name, unit in units.items()}
+    kinds = all_kinds - {""}
     if mapping.amplitude:
         if of_units - {mapping.amplitude}:
             raise ValueError(
-                f"--amplitude says {mapping.amplitude}, but a unit says {min(of_units)}: which is "
-                "right?"
+                f"--amplitude states {mapping.amplitude}, but a unit states {min(of_units)}: "
+                "which is right?"
             )
         return float(AMPLITUDE_FACTORS[mapping.amplitude])
-    if len(sizes) > 1 or (sizes and "" in said and sizes != {"peak"}):
+    if len(kinds) > 1 or (kinds and "" in all_kinds and kinds != {"peak"}):
         raise ValueError(
-            f"names and units say {' and '.join(sorted(sizes))} of some columns and not of others: "
-            "which holds for all? --amplitude peak, rms or peak_to_peak."
+            f"names and units state {' and '.join(sorted(kinds))} for some columns but not for "
+            "others: which holds for all? --amplitude peak, rms or peak_to_peak."
         )
-    size = next(iter(sizes), "peak")
-    told = Fact("units_say_so") if of_units else Fact("by_names_of_columns")
-    assumed.add("amplitude", told if sizes else Fact("nothing_is_said"), size)
-    return float(AMPLITUDE_FACTORS[size])
+    kind = next(iter(kinds), "peak")
+    reason = Fact("units_say_so") if of_units else Fact("by_names_of_columns")
+    assumed.add("amplitude", reason if kinds else Fact("nothing_is_said"), kind)
+    return float(AMPLITUDE_FACTORS[kind])
 
 
 def frequency_in_rad(
     values: Float[np.ndarray, " row"], mapping: ImportMap, file_unit: str, assumed: Assumptions
 ) -> Float[np.ndarray, " row"]:
-    """Frequencies in rad/s; hertz where nothing is said."""
+    """Frequencies in rad/s, from hertz unless stated otherwise."""
     unit = mapping.frequency_unit or file_unit
     if not unit:
         if mapping.frequency.lower().rsplit(".", 1)[-1] in ("w", "omega", "om"):
@@ -205,7 +205,7 @@ def frequency_in_rad(
         assumed.add("frequency_unit", Fact("nothing_is_said"), "Hz")
         return values * _HERTZ
     assumed.unit("frequency_unit", mapping.frequency_unit, file_unit)
-    meaning = _understood(unit, "--frequency-unit")
+    meaning = _meaning(unit, "--frequency-unit")
     if meaning.dimension != "frequency":
         way = "--frequency-unit is Hz or rad/s" if mapping.frequency_unit else ""
         raise ValueError(
@@ -224,7 +224,7 @@ def phase_in_rad(
 ) -> Float[np.ndarray, "*row"]:
     """Phases in rad, positive where the response leads.
 
-    Raises `ValueError` with a question where degrees and radians are both possible.
+    Raises `ValueError` with a question where both degrees and radians are possible.
     """
     stated = unit_meaning(file_unit) if file_unit else None
     if stated and stated.dimension != "angle" and not mapping.phase_unit:
@@ -248,14 +248,14 @@ def phase_in_rad(
     return sign * (np.radians(values) if unit == "deg" else values)
 
 
-def _understood_or_none(unit: str) -> UnitMeaning | None:
+def _meaning_or_none(unit: str) -> UnitMeaning | None:
     try:
         return unit_meaning(unit)
     except ValueError:
         return None
 
 
-def _understood(unit: str, option: str) -> UnitMeaning:
+def _meaning(unit: str, option: str) -> UnitMeaning:
     try:
         return unit_meaning(unit)
     except ValueError as error:

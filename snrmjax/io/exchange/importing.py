@@ -1,4 +1,4 @@
-"""An import: files and a map to steady states, or to records of decays."""
+"""Import of files by a map: steady states, or time records."""
 
 import dataclasses
 from collections.abc import Collection, Sequence
@@ -39,9 +39,9 @@ from snrmjax.numerics.facts import Fact
 
 
 class Imported(NamedTuple):
-    """What an import gave: steady states, or records that stay records.
+    """Result of an import: steady states, or records kept as such.
 
-    `used` is the map with all that was found, `assumed` the reason of each key that nobody stated.
+    `used` is the completed map, `assumed` the reason of each key that was not stated.
     """
 
     states: SteadyStates | None
@@ -49,11 +49,11 @@ class Imported(NamedTuple):
     used: ImportMap
     assumed: Assumptions
     notes: tuple[Fact, ...]
-    steps: StepCounts | None = None  # of all records that are stepped sines
+    steps: StepCounts | None = None  # of all stepped-sine records
 
 
 class _Dataset(NamedTuple):
-    """One thing of a file that can be imported."""
+    """One dataset of a file that can be imported."""
 
     name: str
     file: str
@@ -66,43 +66,43 @@ def import_files(
 ) -> Imported:
     """Import the files of one test.
 
-    Arguments: `mapping` says which channel or column is what; the same for all files; `stated` are
-    its keys that must have an effect.
+    Arguments: `mapping` gives the meaning of channels and columns, the same for all files; `stated`
+    are its keys that must have an effect.
     Returns `Imported`. Raises `ValueError`: as `read_laboratory_file` does, and with a question
-    that names the option where something cannot be told.
+    that names the option where something is undetermined.
     """
     assumed, notes = Assumptions(), list[Fact]()
     datasets: list[_Dataset] = []
-    how = mapping.text_format, mapping.even_axis
-    files = [read_laboratory_file(path, *how) for path in paths]
+    text_and_axis = mapping.text_format, mapping.even_axis
+    files = [read_laboratory_file(path, *text_and_axis) for path in paths]
     refuse_unused_axis(stated, files)
     files = joined_files(files)
-    for held in files:
-        datasets += _datasets(held, mapping, strict="dataset" in stated)
+    for source in files:
+        datasets += _datasets(source, mapping, strict="dataset" in stated)
         notes += [
-            Fact("note_of_file", file=held.name, note=note)
-            for note in held.notes
+            Fact("note_of_file", file=source.name, note=note)
+            for note in source.notes
             if not (mapping.rate and note.kind == "rate_left_open")
         ]
     if len({type(dataset.content) for dataset in datasets}) > 1:
         listed = ", ".join(f"{dataset.file}: {dataset.name}" for dataset in datasets)
-        raise ValueError(f"files of one test must hold things of one kind, but have {listed}.")
+        raise ValueError(f"files of one test must hold datasets of one kind, but have {listed}.")
     if mapping.dataset == "" and len(datasets) == 1:
         mapping = mapping._replace(dataset=datasets[0].name)
     file = datasets[0].file
     contents = [(dataset.content, dataset.file) for dataset in datasets]
     records = [(content, name) for content, name in contents if isinstance(content, TimeRecording)]
     tables = [(content, name) for content, name in contents if isinstance(content, NumberTable)]
-    ours = [(table, name) for table, name in tables if is_ours(table.columns)]
-    own = bool(ours) and not mapping.responses
+    own_tables = [(table, name) for table, name in tables if is_ours(table.columns)]
+    is_own = bool(own_tables) and not mapping.responses
     kind: Content = (
-        "records" if records else "own table" if own else "table" if tables else "responses"
+        "records" if records else "own table" if is_own else "table" if tables else "responses"
     )
-    refuse_unused(stated, kind, mapping, file, [held.kind for held in files])
+    refuse_unused(stated, kind, mapping, file, [source.kind for source in files])
     if records:
         return _records(records, mapping, assumed, notes)
-    if own:
-        parts = [restated(states_of_own_table(table, name), mapping) for table, name in ours]
+    if is_own:
+        parts = [restated(states_of_own_table(table, name), mapping) for table, name in own_tables]
         notes.append(restated_how(mapping))
         return Imported(join_steady_states(parts), (), mapping, assumed, tuple(notes))
     each = mapping.force_amplitude
@@ -111,8 +111,8 @@ def import_files(
     else:
         mappings = [mapping] * len(tables)
     imported = [
-        import_table(table, told, name, assumed)
-        for (table, name), told in zip(tables, mappings, strict=True)
+        import_table(table, file_map, name, assumed)
+        for (table, name), file_map in zip(tables, mappings, strict=True)
     ] or [
         import_responses(content, z, mapping, name, assumed)
         for _, name, content, z in datasets
@@ -127,31 +127,33 @@ def import_files(
 
 
 def joined_files(files: Sequence[LaboratoryFile]) -> list[LaboratoryFile]:
-    """Files of one channel each on one clock as one file with one record; others as they are."""
-    held = {file.name: file.recordings for file in files if file.recordings}
-    joined = joined_by_clock(held) if len(held) == len(files) else None
+    """Join files of one channel each on a common clock into one record; others are unchanged."""
+    recordings = {file.name: file.recordings for file in files if file.recordings}
+    joined = joined_by_clock(recordings) if len(recordings) == len(files) else None
     if joined is None or any(file.tables or file.responses for file in files):
         return list(files)
     record, name = joined
-    told = [Fact("channels_of_files", files=tuple(held))]
-    notes = tuple(dict.fromkeys([*told, *(note for file in files for note in file.notes)]))
+    joined_note = [Fact("channels_of_files", files=tuple(recordings))]
+    notes = tuple(dict.fromkeys([*joined_note, *(note for file in files for note in file.notes)]))
     return [LaboratoryFile(name, files[0].kind, (record,), notes=notes)]
 
 
-def _datasets(held: LaboratoryFile, mapping: ImportMap, *, strict: bool = False) -> list[_Dataset]:
-    """What of a file is imported. Raises `ValueError` with a question where that is not one."""
-    parts = [_Dataset(record.name or "record", held.name, record) for record in held.recordings]
-    parts += [_Dataset(table.name, held.name, table) for table in held.tables]
-    if held.responses:
-        parts.append(_Dataset("responses", held.name, held.responses, held.levels))
+def _datasets(
+    source: LaboratoryFile, mapping: ImportMap, *, strict: bool = False
+) -> list[_Dataset]:
+    """The datasets to import. Raises `ValueError` with a question where they are ambiguous."""
+    parts = [_Dataset(record.name or "record", source.name, record) for record in source.recordings]
+    parts += [_Dataset(table.name, source.name, table) for table in source.tables]
+    if source.responses:
+        parts.append(_Dataset("responses", source.name, source.responses, source.levels))
     names = ", ".join(dataset.name for dataset in parts)
     named = [dataset for dataset in parts if dataset.name == mapping.dataset != ""]
     if named or (len(parts) == 1 and not strict):
         return named or parts
     if mapping.dataset:
-        raise ValueError(f"--dataset names {mapping.dataset!r}, but {held.name} has {names}.")
-    if len(parts) > len(held.recordings):
-        raise ValueError(f"which part of {held.name} is meant? --dataset names it, of {names}.")
+        raise ValueError(f"--dataset names {mapping.dataset!r}, but {source.name} has {names}.")
+    if len(parts) > len(source.recordings):
+        raise ValueError(f"which part of {source.name} is meant? --dataset names it, of {names}.")
     return parts
 
 
@@ -164,7 +166,7 @@ def _records(
     if mapping.phase_sign == "lag":
         raise ValueError(
             f"--phase-sign must be left out of the time records of {records[0][1]}: phases follow "
-            "from force and motion there. A sensor of the other sign is turned in the model's "
+            "from force and motion there. Change the sign of an inverted sensor in the model's "
             "`shape`."
         )
     parts: list[SteadyStates] = []
@@ -211,24 +213,24 @@ def _phasors(
     """Steady states of tables and frequency responses."""
     velocity = np.concatenate([part.velocity for part in parts])
     if not np.any(np.abs(velocity) > 0):
-        raise ValueError(f"{file} has nothing but zero responses.")
+        raise ValueError(f"{file} has only zero responses.")
     keyed = all(part.key is not None for part in parts)
     number, rule = numbered_levels(parts, level or (used.level if keyed else ""), assumed)
-    size = np.concatenate([part.force for part in parts])
-    missing = np.full(len(size), np.nan)
+    amplitude = np.concatenate([part.force for part in parts])
+    missing = np.full(len(amplitude), np.nan)
     states = steady_states(
         number,
         np.concatenate([part.frequency for part in parts]),
-        missing if force.is_voltage else size,
+        missing if force.is_voltage else amplitude,
         np.where(np.isfinite(velocity), velocity, 0.0),
         measured=np.isfinite(velocity),
         sensors=[response.sensor for response in used.responses],
-        drive=size if force.is_voltage else missing,
+        drive=amplitude if force.is_voltage else missing,
         velocity_std=np.concatenate([part.velocity_std for part in parts]),
         phase_std=np.concatenate([part.phase_std for part in parts]),
         base=None if force.motion is None else BaseMotion("relative"),
     )
-    # Choices that were assumed go into the map, so that the next test is read alike.
+    # Assumed choices go into the map, so that the next test is read the same way.
     keys = {"amplitude", "phase_sign", "phase_unit"}.intersection(assumed)
     words: dict[str, Any] = {key: assumed[key].value for key in keys}
     used = used._replace(level=rule, **words)

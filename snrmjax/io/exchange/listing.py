@@ -1,4 +1,4 @@
-"""What a laboratory's file holds, in words."""
+"""Listing of the contents of a laboratory file."""
 
 from collections.abc import Sequence
 
@@ -9,22 +9,22 @@ from snrmjax.measure.recordings.velocity_states import number_levels
 from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
-_MOST = 40  # lines of one kind
+_MOST = 40  # lines of one kind at most
 
 
-def listed_contents(held: LaboratoryFile) -> list[str]:
-    """The datasets of a file: channels, rates, lengths, units, places, levels found."""
-    lines = [f"{held.name}: {held.kind}"]
-    for record in held.recordings:
+def listed_contents(contents: LaboratoryFile) -> list[str]:
+    """The datasets of a file: channels, sampling rates, lengths, units, points, detected levels."""
+    lines = [f"{contents.name}: {contents.kind}"]
+    for record in contents.recordings:
         lines += [
             f"  record {record.name or 'record'}: {len(record.channels)} channels of "
             f"{record.n_samples} samples at {record.sampling_rate:.6g} Hz "
             f"({record.duration:.4g} s)",
             *_short([f"    {channel}" for channel in record.channels]),
         ]
-    for table in held.tables:
+    for table in contents.tables:
         lines += [f"  table {table.name}: {table.n_rows} rows", *_columns(table)]
-    for sets, z in zip(held.responses[:_MOST], held.levels, strict=False):
+    for sets, z in zip(contents.responses[:_MOST], contents.levels, strict=False):
         hertz = sets.frequency / _HERTZ
         level = f", z axis {z:g}" if np.isfinite(z) else ""
         lines.append(
@@ -33,9 +33,9 @@ def listed_contents(held: LaboratoryFile) -> list[str]:
         )
         lines += _short([f"    response {channel}" for channel in sets.responses])
         lines += _short([f"    reference {channel}" for channel in sets.references])
-    if len(held.responses) > _MOST:
-        lines.append(f"  … {len(held.responses) - _MOST} further sets of responses")
-    return [*lines, *(f"  note: {note}" for note in held.notes[:_MOST])]
+    if len(contents.responses) > _MOST:
+        lines.append(f"  … {len(contents.responses) - _MOST} further sets of responses")
+    return [*lines, *(f"  note: {note}" for note in contents.notes[:_MOST])]
 
 
 def _short(lines: Sequence[str]) -> list[str]:
@@ -46,8 +46,8 @@ def _short(lines: Sequence[str]) -> list[str]:
 def _columns(table: NumberTable) -> list[str]:
     lines = []
     for name, values in table.columns.items():
-        size = np.abs(values) if np.iscomplexobj(values) else values.astype(float)
-        finite = size[np.isfinite(size)]
+        magnitude = np.abs(values) if np.iscomplexobj(values) else values.astype(float)
+        finite = magnitude[np.isfinite(magnitude)]
         span = f"{finite.min():.5g} to {finite.max():.5g}" if finite.size else "empty"
         role = table.role(name)
         count = len(np.unique(finite))
@@ -58,9 +58,9 @@ def _columns(table: NumberTable) -> list[str]:
     frequency = _first(table, "frequency")
     force = _first(table, "force") or _first(table, "drive")
     if frequency and force and not _first(table, "level"):
-        size = np.abs(table.columns[force])
-        if np.all(size > 0) and np.isfinite(size).all():
-            number, rule = number_levels("auto", size, None, np.real(table.columns[frequency]))
+        magnitude = np.abs(table.columns[force])
+        if np.all(magnitude > 0) and np.isfinite(magnitude).all():
+            number, rule = number_levels("auto", magnitude, None, np.real(table.columns[frequency]))
             fact = Fact("levels_counted", n=len(np.unique(number)), by=rule)
             lines.append(f"    found: {fact}")
     lines += [

@@ -1,4 +1,4 @@
-"""Tables with the columns of our CSV: recognised, read, and restated in other units."""
+"""Tables with the columns of our CSV: detected, read, and converted from other units."""
 
 import dataclasses
 from pathlib import Path
@@ -19,7 +19,7 @@ from snrmjax.numerics.facts import Fact
 
 
 def is_own_file(path: Path) -> bool:
-    """Whether a CSV is meant as ours, by its header: its reader then says what is amiss."""
+    """Whether a CSV has our header; our reader then reports any error."""
     return is_ours(header_of(path))
 
 
@@ -35,11 +35,11 @@ def states_of_own_table(table: NumberTable, file: str) -> SteadyStates:
 
 
 def restated(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
-    """Steady states of our table whose numbers are not what our columns say, in SI.
+    """Steady states in SI, of our table with numbers in other units than the columns state.
 
-    Arguments: of `mapping` the `unit` of the velocity columns (of an acceleration, say), the
+    Arguments: of `mapping` the `unit` of the velocity columns (possibly of an acceleration), the
     `force_unit` (a voltage makes it a drive), `amplitude` and `phase_sign`.
-    Raises `ValueError` for units that are none of a motion or of a force.
+    Raises `ValueError` for units of neither a motion nor a force.
     """
     orders = (1, *states.harmonic_order)
     factors = np.ones((states.n_states, len(orders)), dtype=complex)
@@ -54,22 +54,22 @@ def restated(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
     phasors = phasors * factors[:, None]
     if mapping.phase_sign == "lag":
         phasors = phasors.conj()
-    size = np.abs(factors[:, :1])
-    # What is stated is the rms over the harmonics, whose noise is alike in the unit of the columns.
+    magnitude = np.abs(factors[:, :1])
+    # The stated std is the rms over harmonics, whose noise is equal in the columns' unit.
     noisy = [k for k, order in enumerate(orders) if k and order > 0]
     floor = np.sqrt(np.mean(np.abs(factors[:, noisy]) ** 2, axis=1, keepdims=True)) if noisy else 1
     changed = dataclasses.replace(
         states,
         velocity=jnp.asarray(phasors[:, :, 0]),
         harmonics=jnp.asarray(phasors[:, :, 1:]),
-        velocity_std=states.velocity_std * size,
+        velocity_std=states.velocity_std * magnitude,
         harmonic_std=states.harmonic_std * floor,
     )
     return _with_force(changed, mapping)
 
 
 def _with_force(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
-    """With the force, or the drive in its place, in the unit that is stated."""
+    """With the force, or the drive in its place, converted from the stated unit."""
     if states.base is not None:
         return _with_base(states, mapping)
     force = force_meaning(mapping, "N", "the force")
@@ -86,7 +86,7 @@ def _with_force(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
 
 
 def _with_base(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
-    """With the base's acceleration in the unit that is stated."""
+    """With the base acceleration converted from the stated unit."""
     factor = AMPLITUDE_FACTORS[mapping.amplitude]
     if mapping.force_unit:
         quantity, by_unit, _ = motion_meaning(
@@ -104,7 +104,7 @@ def _with_base(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
 
 
 def restated_how(mapping: ImportMap) -> Fact:
-    """What of our table is said to be otherwise."""
+    """Note on the units and conventions converted."""
     return Fact(
         "our_own_table",
         unit=mapping.unit,
@@ -115,7 +115,7 @@ def restated_how(mapping: ImportMap) -> Fact:
 
 
 def _text(value: float) -> str:
-    """A number in full; nothing where it is not stated, and a whole number without a point."""
+    """A number in full precision; empty for NaN, whole numbers without a point."""
     number = float(value)
     if np.isnan(number):
         return ""

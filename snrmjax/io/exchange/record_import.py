@@ -1,4 +1,4 @@
-"""Steady states, or records of a decay, of a laboratory's time records."""
+"""Import of time records, as steady states or as records."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -19,36 +19,36 @@ from snrmjax.measure.sweeps.slow_sweep import sweep_states
 from snrmjax.numerics.facts import Fact
 
 ENDINGS = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
-"""Units of motions in names of columns."""
+"""Unit suffixes of motion columns."""
 
-_FEW_DIGITS = 0.02  # relative: two digits of a step
+_FEW_DIGITS = 0.02  # relative error of a time step with two digits
 _DIRECT: dict[str, Levels] = {"force": "force", "drive": "drive", "runs": "runs"}
 
 
 def ask_for_rate(notes: Iterable[Fact | str], rate: float, file: str) -> None:
-    """Raise `ValueError` where a file's few digits leave its sampling rate open.
+    """Raise `ValueError` where too few digits leave the sampling rate undetermined.
 
-    Arguments: `rate` (Hz) is what is stated instead, or 0.
+    Arguments: `rate` (Hz) stated instead, or 0.
     """
     for note in notes:
         if not rate and isinstance(note, Fact) and note.kind == "rate_left_open":
             raise ValueError(
-                f"which sampling rate has {file}? Its step of {note['step']} s has few digits, so "
-                f"that frequencies may be off by {note['off']:.1g} %. Say so by "
-                f"`--rate {note['rate']:g}`, if that is it."
+                f"which sampling rate has {file}? Its step of {note['step']} s has few digits, "
+                f"so that frequencies may be off by {note['off']:.1g} %. Confirm it by "
+                f"`--rate {note['rate']:g}`, or state another."
             )
 
 
 def at_stated_rate(record: TimeRecording, rate: float, file: str) -> TimeRecording:
-    """A record with the sampling rate (Hz) that is stated, if one is; 0: its own.
+    """A record with the stated sampling rate (Hz); 0 keeps its own.
 
-    Raises `ValueError` for one that a few digits of the file's own do not explain.
+    Raises `ValueError` for a difference larger than rounding of the file's time step explains.
     """
     own = record.sampling_rate
     if rate and abs(rate / own - 1) > _FEW_DIGITS:
         raise ValueError(
-            f"--rate says {rate:g} Hz, but {file} {own:g} Hz: which of both is right? Few digits "
-            "of the file do not explain that much."
+            f"--rate states {rate:g} Hz, but {file} {own:g} Hz: which is right? Rounding of the "
+            "file's time step does not explain that much."
         )
     return dataclasses.replace(record, sampling_rate=rate) if rate else record
 
@@ -56,9 +56,9 @@ def at_stated_rate(record: TimeRecording, rate: float, file: str) -> TimeRecordi
 def mapped_record(
     record: TimeRecording, mapping: ImportMap, file: str, assumed: Assumptions
 ) -> tuple[TimeRecording, ImportMap]:
-    """The channels of a map with their quantities and units, and the map with what was found.
+    """The record with quantities and units of the map, and the completed map.
 
-    Raises `ValueError` with a question that names the option for what cannot be told.
+    Raises `ValueError` with a question that names the option for anything undetermined.
     """
     if not mapping.responses:
         names = ", ".join(record.channel_names)
@@ -98,8 +98,7 @@ def mapped_record(
         old = channels[k]
         if response.channel in (mapping.load, mapping.drive):
             raise ValueError(
-                f"{response.channel} of {file} is named as the response and as what drives the "
-                "structure: one channel is one of the two."
+                f"{response.channel} of {file} is named both as the response and as the excitation."
             )
         if old.quantity == "voltage" and not response.unit:
             old = old._replace(unit="")
@@ -123,10 +122,10 @@ def mapped_record(
 def import_record(
     record: TimeRecording, mapping: ImportMap, file: str, assumed: Assumptions
 ) -> tuple[SteadyStates | None, ImportMap, tuple[Fact | str, ...], StepCounts | None]:
-    """Steady states of a record of steps or of sweeps, or None for one that stays a record.
+    """Steady states of a record of steps or sweeps; None for a record kept as such.
 
-    Returns them, the map with what was found, notes, and how many of the steps were used.
-    Raises `ValueError` with a question that names the option for what cannot be told.
+    Returns them, the completed map, notes, and the numbers of steps used and left out.
+    Raises `ValueError` with a question that names the option for anything undetermined.
     """
     if mapping.record in ("decay", "broadband"):
         return None, mapping, (), None
@@ -134,7 +133,7 @@ def import_record(
         raise ValueError(
             f"which channel of {file} is the force? --force CHANNEL names it, of "
             f"{', '.join(record.channel_names)}; --base CHANNEL:acceleration is the motion of a "
-            "base, and --record decay says that there is none."
+            "base, and --record decay states that there is none."
         )
     if mapping.level and mapping.level not in (*_DIRECT, "auto", "file"):
         raise ValueError(
@@ -142,24 +141,24 @@ def import_record(
             f"{mapping.level!r}."
         )
     level = _DIRECT.get(mapping.level, "auto")
-    said: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "level": level,
         "sensors": [response.sensor for response in mapping.responses],
         "drive": mapping.drive or None,
         "is_base": bool(mapping.base),
     }
-    read = record, mapping.load, [response.channel for response in mapping.responses]
-    failed = []
+    signals = record, mapping.load, [response.channel for response in mapping.responses]
+    failures = []
     for kind in (mapping.record,) if mapping.record else ("steps", "sweep"):
         try:
             if kind == "steps":
-                steps = stepped_sine_states(*read, **said)
+                steps = stepped_sine_states(*signals, **settings)
                 states, notes, counts = steps.states, steps.notes, steps.counts
             else:
-                swept = sweep_states(*read, **said)
+                swept = sweep_states(*signals, **settings)
                 states, notes, counts = swept.states, swept.notes, None
         except ValueError as error:
-            failed.append(f"{kind}: {error}")
+            failures.append(f"{kind}: {error}")
             continue
         if not mapping.record:
             assumed.add("record", Fact("record_recognised"), kind)
@@ -167,15 +166,15 @@ def import_record(
             assumed.add("level", Fact("levels_found", n=len(np.unique(states.level))))
         return states, mapping._replace(record=kind, level=mapping.level or level), notes, counts
     if mapping.record:
-        raise ValueError(f"{file} does not read as {failed[0]}")
+        raise ValueError(f"{file} does not read as {failures[0]}")
     raise ValueError(
         f"what is the record of {file}: --record steps, sweep, decay or broadband? It was read "
-        f"neither as {' Nor as '.join(failed)}"
+        f"neither as {' Nor as '.join(failures)}"
     )
 
 
 def record_columns(record: TimeRecording, mapping: ImportMap) -> dict[str, Channel]:
-    """Names of the columns of a record's table, with the channels that they hold, in SI."""
+    """Column names of a record's table in SI, with their channels."""
     columns: dict[str, Channel] = {}
     by_name = {response.name: response for response in record.channels}
     if mapping.force:

@@ -1,4 +1,4 @@
-"""Steady states of frequency responses and spectra (UFF 58 and its relatives)."""
+"""Steady states from frequency responses and spectra (UFF 58 and similar)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -21,12 +21,12 @@ from snrmjax.measure.recordings.channels import SI_UNIT, Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.numerics.facts import Fact
 
-_FREQUENCY, _FORCE, _SET = "frequency of the lines", "force behind the responses", "set"
+_FREQUENCY, _FORCE, _SET = "frequency of the lines", "reference force", "set"
 _RULES = ("force", "runs", "file")
 
 
 class _Sets(NamedTuple):
-    """Frequency responses of a file, one set a level, and what a map says of them."""
+    """Frequency responses of a file, one set a level, with their map."""
 
     sets: Sequence[FrequencyResponses]
     z: Sequence[float]
@@ -35,37 +35,38 @@ class _Sets(NamedTuple):
 
     @property
     def has_force(self) -> bool:
-        """Whether the force is among the responses: they are spectra, or over a generator."""
+        """Whether the force is one of the responses (spectra, or relative to a generator)."""
         named = [self.mapping.load in _names(each.responses) for each in self.sets]
         return bool(self.mapping.load) and all(named)
 
     def references(self) -> list[int]:
-        """Which reference of each set the responses are over."""
-        force, file, places = self.mapping.load, self.file, []
+        """Index of the reference of the responses in each set."""
+        force, file, indices = self.mapping.load, self.file, []
         option = "--base" if self.mapping.base else "--force"
         for each in self.sets:
             names = _names(each.references)
             if force and not self.has_force:
-                what = f"responses {', '.join(_names(each.responses))}, and over the references"
+                what = f"responses {', '.join(_names(each.responses))}, and the references"
                 require_name(option, force, names, what, file)
-                places.append(names.index(force))
+                indices.append(names.index(force))
             elif len(names) > 1:
                 listed = ", ".join(names)
                 if self.has_force:
                     raise ValueError(
-                        f"{force} of {file} is over {len(names)} references ({listed}): export it "
-                        f"and the responses over one of them, or name a reference by {option}."
+                        f"{force} of {file} has {len(names)} references ({listed}): export it "
+                        f"and the responses relative to one of them, or name a reference by "
+                        f"{option}."
                     )
                 raise ValueError(
                     f"which reference of {file} is the force? --force names it, of {listed} "
                     "(--base NAME:acceleration, if it is the motion of a base)."
                 )
             else:
-                places.append(0)
-        return places
+                indices.append(0)
+        return indices
 
     def column(self, name: str, unit: str, option: str) -> tuple[np.ndarray, Channel]:
-        """All lines of a response, in SI or, where its unit is stated, as the file has them."""
+        """All lines of a response, in SI or, with a stated unit, in the numbers of the file."""
         parts = []
         for each, reference in zip(self.sets, self.references(), strict=True):
             require_name(option, name, _names(each.responses), "responses", self.file)
@@ -81,20 +82,20 @@ class _Sets(NamedTuple):
             return self._base_amplitudes()
         stated, file, n = self.mapping.force_amplitude, self.file, len(self.sets)
         if stated == (BY_NAME,):
-            said = amplitude_of_name(file)
-            if said is None or said[1] != "N":
+            amplitude = amplitude_of_name(file)
+            if amplitude is None or amplitude[1] != "N":
                 raise ValueError(
                     f"the name of {file} must state one amplitude in newtons, as frf_0.4N.uff does."
                 )
-            return np.full(n, said[0])
+            return np.full(n, amplitude[0])
         has_z = bool(np.isfinite(self.z).all())
         if not stated:
             levels = ", ".join(f"{value:g}" for value in self.z)
             way = f"z if they are the z axis' ({levels}), else N" if has_z else "N, one for all or"
             raise ValueError(
-                f"which amplitude had the force of {file}, whose responses are over it? "
-                f"--force-amplitude {way} one a set ({n}); `snrmjax modes` takes frequency "
-                "responses as they are."
+                f"which force amplitude had {file}, whose responses are per unit force? "
+                f"--force-amplitude {way} one a set ({n}); `snrmjax modes` reads frequency "
+                "responses directly."
             )
         if stated == ("z",) and not (has_z and np.all(np.asarray(self.z) > 0)):
             raise ValueError(
@@ -114,14 +115,14 @@ class _Sets(NamedTuple):
         stated, n = self.mapping.base_amplitudes, len(self.sets)
         if len(stated) not in (1, n):
             raise ValueError(
-                f"which amplitude had the base of {self.file}, over whose motion its responses "
-                "are? --base 0.5:acceleration:g states one for all"
+                f"which amplitude had the base of {self.file}, whose responses are per base "
+                "motion? --base 0.5:acceleration:g states one for all"
                 + (f", or one for each of the {n} sets with commas." if n > 1 else ".")
             )
         return np.broadcast_to(np.asarray(stated), (n,))
 
-    def force_behind(self) -> tuple[Force, bool]:
-        """What the responses are over, and whether the file says in which unit."""
+    def reference_force(self) -> tuple[Force, bool]:
+        """The denominator of the responses, and whether the file states its unit."""
         mapping, file = self.mapping, self.file
         if mapping.base:
             base, known = load_meaning(mapping, "", "the base"), False
@@ -129,7 +130,7 @@ class _Sets(NamedTuple):
                 channel = each.references[reference]
                 if channel.quantity not in ("unknown", base.motion):
                     raise ValueError(
-                        f"--base says {base.motion}, but the responses of {file} are over "
+                        f"--base states {base.motion}, but the responses of {file} are relative to "
                         f"{channel.name}, of {channel.quantity}: which of both is right?"
                     )
                 known = known or channel.quantity != "unknown"
@@ -138,9 +139,9 @@ class _Sets(NamedTuple):
         for channel in [each.references[reference] for each, reference in pairs]:
             if mapping.force_unit and channel.si_unit not in ("", mapping.force_unit):
                 raise ValueError(
-                    f"--force-unit says {mapping.force_unit}, but the responses of {file} are over "
-                    f"{channel.name} in {channel.si_unit}, in which --force-amplitude is stated "
-                    "too: leave --force-unit out."
+                    f"--force-unit states {mapping.force_unit}, but the responses of {file} are "
+                    f"per {channel.name} in {channel.si_unit}, also the unit of --force-amplitude: "
+                    "leave --force-unit out."
                 )
         force = force_meaning(mapping, channel.si_unit or "N", f"{channel.name} of {file}")
         return force, bool(channel.si_unit)
@@ -155,9 +156,9 @@ def import_responses(
 ) -> tuple[MeasuredPart, ImportMap, Force, list[Fact]]:
     """States of sets of frequency responses, one set a level.
 
-    The force is a channel among the responses (spectra, or responses over a generator), or the
-    reference, whose amplitude the map states: one for all, one a set, or the z axis.
-    Raises `ValueError` with a question that names the option for what cannot be told.
+    The force is a channel among the responses (spectra, or responses per generator signal), or the
+    reference, with the amplitude of the map: one for all, one a set, or the z axis.
+    Raises `ValueError` with a question that names the option for anything undetermined.
     """
     if not mapping.responses:
         named = ", ".join(dict.fromkeys(name for each in sets for name in _names(each.responses)))
@@ -171,11 +172,11 @@ def import_responses(
     if mapping.level == "z" and not np.isfinite(z).all():
         raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
     source = _Sets(sets, z, mapping, file)
-    sizes = [each.frequency.size for each in sets]
+    n_lines = [each.frequency.size for each in sets]
     numbers = z if mapping.level == "z" else np.arange(1.0, len(sets) + 1)
     columns = {
-        _FREQUENCY: _or_nothing(np.concatenate([each.frequency for each in sets])),
-        _SET: np.repeat(numbers, sizes),
+        _FREQUENCY: _nan_for_zero(np.concatenate([each.frequency for each in sets])),
+        _SET: np.repeat(numbers, n_lines),
     }
     units = {_FREQUENCY: "rad/s"}
     rule = mapping.level if mapping.level in _RULES else _SET
@@ -188,13 +189,13 @@ def import_responses(
         name = mapping.load
         unit = mapping.base_motion.unit if mapping.base else mapping.force_unit
         values, channel = source.column(name, unit, "--force")
-        columns[name] = _or_nothing(values)
+        columns[name] = _nan_for_zero(values)
         units[name] = channel.unit if unit else channel.si_unit
         assumed.add("force_amplitude", Fact("spectra_of_one_reference"))
     else:
-        force, is_stated = source.force_behind()
-        amplitudes = np.repeat(source.amplitudes(), sizes)
-        if is_stated and force.motion is not None:  # the responses are over SI
+        force, is_stated = source.reference_force()
+        amplitudes = np.repeat(source.amplitudes(), n_lines)
+        if is_stated and force.motion is not None:  # the reference is in SI
             columns[_FORCE], units[_FORCE] = amplitudes * force.factor, SI_UNIT[force.motion]
         else:
             columns[_FORCE], units[_FORCE] = amplitudes, force.unit
@@ -225,8 +226,8 @@ def import_responses(
     return part, mapping, force, notes
 
 
-def _or_nothing(values: np.ndarray) -> np.ndarray:
-    """Values with NaN for zero: lines without a force, or of no frequency, are left out."""
+def _nan_for_zero(values: np.ndarray) -> np.ndarray:
+    """Values with NaN for zero, so that lines of zero force or frequency are left out."""
     return np.where(values == 0, np.nan, values)
 
 

@@ -1,4 +1,4 @@
-"""Steady states of a table of a laboratory: amplitude and phase, real and imaginary part."""
+"""Steady states from laboratory tables: amplitude and phase, or real and imaginary part."""
 
 import re
 from typing import Any, NamedTuple
@@ -33,16 +33,16 @@ _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
 
 
 class _Source(NamedTuple):
-    """A table, what the map says of it, and what is assumed."""
+    """A table with its map and the assumptions made."""
 
     table: NumberTable
     mapping: ImportMap
     file: str
     assumed: Assumptions
-    levels: frozenset[str] = frozenset()  # columns that the file has in dB
+    levels: frozenset[str] = frozenset()  # columns that are in dB in the file
 
     def unit(self, name: str) -> str:
-        """The file's word for a column's unit."""
+        """A column's unit as written in the file."""
         return self.table.units.get(name, "")
 
     def column(self, name: str, option: str) -> np.ndarray:
@@ -51,14 +51,14 @@ class _Source(NamedTuple):
         return np.asarray(self.table.columns[name])
 
     def real(self, name: str, option: str) -> Float[np.ndarray, " row"]:
-        """Likewise, of real numbers."""
+        """A column of real numbers that an option names."""
         values = self.column(name, option)
         if np.iscomplexobj(values):
             raise ValueError(f"{option} must name a column of real numbers, but {name} is complex.")
         return values.astype(float)
 
     def phasors(self, values: np.ndarray) -> np.ndarray:
-        """Phasors as e^(+iwt), conjugated where the sign of their phases is said to be another."""
+        """Phasors for e^(+iωt), conjugated where the map states the other phase sign."""
         if np.iscomplexobj(values) and not self.mapping.phase_sign:
             self.assumed.add("phase_sign", Fact("phasors_turn_forward"), "lead")
         phasors = values.astype(complex)
@@ -70,21 +70,21 @@ class _Source(NamedTuple):
         return phase_in_rad(values, name, self.mapping, self.unit(name), self.assumed)
 
     def with_role(self, *roles: str) -> list[str]:
-        """Columns whose names or units say that they have one of these roles."""
+        """Columns with one of these roles by name or unit."""
         return [name for name in self.table.columns if self.table.role(name) in roles]
 
     @property
     def listed(self) -> str:
-        """The columns, as messages name them."""
+        """The column names, for messages."""
         return ", ".join(self.table.columns)
 
 
 def import_table(
     table: NumberTable, mapping: ImportMap, file: str, assumed: Assumptions
 ) -> tuple[MeasuredPart, ImportMap, Force, list[Fact]]:
-    """States of a table, the map with what was found, the force's unit, and notes.
+    """States of a table, the completed map, the force's unit, and notes.
 
-    Raises `ValueError` with a question that names the option for what cannot be told.
+    Raises `ValueError` with a question that names the option for anything undetermined.
     """
     mapping = mapping.with_names({name: table.units.get(name, "") for name in table.columns})
     table, mapping, notes = with_stated_references(table, mapping, file)
@@ -103,7 +103,7 @@ def import_table(
             f"which column of {file} is the response? --response COLUMN:velocity (or acceleration, "
             f"displacement) names it, of {source.listed}."
         )
-    size, force = _force(source)
+    force_phasor, force = _force(source)
     lead = force.acceleration(omega)
     units = {
         response.channel: response.unit or source.unit(response.channel)
@@ -113,27 +113,34 @@ def import_table(
     is_column = bool(mapping.load)
     units |= {mapping.load: force.unit} if is_column else {}
     peak = amplitude_factor(mapping, units, assumed) if units else 1.0
-    size = size * peak if is_column or mapping.amplitude else size
-    # Over the force only its amplitude counts; else phases are of one clock with the force's own.
-    # Of a base phases count from its acceleration, whatever of its motion was recorded.
-    turn = np.abs(size) if mapping.over_force else peak * np.exp(-1j * np.angle(size))
-    turn, size = turn * np.exp(-1j * np.angle(lead)), size * lead
+    force_phasor = force_phasor * peak if is_column or mapping.amplitude else force_phasor
+    # Responses per force need only its amplitude; else its phase is subtracted. For a base, phases
+    # are relative to its acceleration, whichever motion was recorded.
+    phase_factor = (
+        np.abs(force_phasor) if mapping.over_force else peak * np.exp(-1j * np.angle(force_phasor))
+    )
+    phase_factor, force_phasor = phase_factor * np.exp(-1j * np.angle(lead)), force_phasor * lead
     _refuse_doubled(source)
     velocity, responses, errors = [], [], []
     for k, response in enumerate(mapping.responses):
         response = _with_errors_by_name(source, response, k + 1)
         row, filled, scale = _response(source, response, force, omega, k + 1)
-        velocity.append(row * turn)
+        velocity.append(row * phase_factor)
         responses.append(filled)
-        errors.append(_errors(source, filled, np.abs(scale * turn)))
+        errors.append(_errors(source, filled, np.abs(scale * phase_factor)))
     phasors = np.stack(velocity, axis=1)
     amplitude_std, phase_std = np.moveaxis(np.array(errors), (0, 1, 2), (2, 0, 1))
     level, key = _level(source)
     mapping = mapping._replace(responses=tuple(responses), level=level)
-    good = np.isfinite(omega) & np.isfinite(size) & np.isfinite(phasors).any(axis=1)
-    _check(omega[good], np.abs(size[good]), file)
+    good = np.isfinite(omega) & np.isfinite(force_phasor) & np.isfinite(phasors).any(axis=1)
+    _check(omega[good], np.abs(force_phasor[good]), file)
     part = MeasuredPart(
-        *(omega[good], np.abs(size[good]), phasors[good], None if key is None else key[good]),
+        *(
+            omega[good],
+            np.abs(force_phasor[good]),
+            phasors[good],
+            None if key is None else key[good],
+        ),
         *(amplitude_std[good], phase_std[good]),
     )
     left_out = int(np.sum(~good))
@@ -142,20 +149,20 @@ def import_table(
 
 
 def _frequency_column(source: _Source) -> str:
-    """The only column that is a frequency by its name or unit."""
+    """The unique column that is a frequency by name or unit."""
     columns = source.with_role("frequency")
     if len(columns) != 1:
         raise ValueError(
             f"which column of {source.file} is the frequency? --frequency names it, of "
             f"{', '.join(columns) or source.listed}; --frequency-start and --frequency-step state "
-            "frequencies that no column has."
+            "frequencies without a column."
         )
     source.assumed.add("frequency", Fact("column_by_name"))
     return columns[0]
 
 
 def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
-    """The force (or the motion of the base) of every row, of a column or as stated."""
+    """The force (or base motion) of every row, from a column or as stated."""
     mapping, file = source.mapping, source.file
     option = "--base" if mapping.base else "--force"
     name = mapping.load
@@ -173,7 +180,7 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
         if not amplitudes:
             raise ValueError(
                 f"which column of {file} is the force? --force COLUMN names it, of "
-                f"{source.listed}; --force-amplitude N states one that no column has, and --base "
+                f"{source.listed}; --force-amplitude N states one without a column, and --base "
                 "COLUMN:acceleration the motion of a base."
             )
         force = load_meaning(mapping, "" if mapping.base else "N", "--force-amplitude")
@@ -187,22 +194,24 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
         raise ValueError(
             f"{name} of {file} has negative amplitudes: {option} names another column."
         )
-    size = source.phasors(raw) * force.factor
+    force_phasor = source.phasors(raw) * force.factor
     if mapping.force_phase:
-        size = size * np.exp(1j * source.phase(mapping.force_phase, "--force-phase"))
-    return size, force
+        force_phasor = force_phasor * np.exp(
+            1j * source.phase(mapping.force_phase, "--force-phase")
+        )
+    return force_phasor, force
 
 
 def _by_name(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
-    """The force that the file's name states, in the unit that it states, or another one."""
+    """The force (or base motion) stated by the file name."""
     mapping, file = source.mapping, source.file
-    said = amplitude_of_name(file)
-    if said is None:
+    stated = amplitude_of_name(file)
+    if stated is None:
         raise ValueError(
             f"the name of {file} must state one amplitude with its unit, as sine_0.4N.csv does: "
             "rename it, or give --force-amplitude a number."
         )
-    amplitude, unit = said
+    amplitude, unit = stated
     force = load_meaning(mapping, unit, f"the amplitude in the name of {file}")
     return np.full(source.table.n_rows, amplitude * force.factor, dtype=complex), force
 
@@ -214,9 +223,9 @@ def _response(
     omega: Float[np.ndarray, " row"],
     number: int,
 ) -> tuple[Complex[np.ndarray, " row"], ResponseMap, Complex[np.ndarray, " row"]]:
-    """The velocity phasors of one response (over the force where the table has it so).
+    """Velocity phasors of one response (per force where the table has them so).
 
-    And the map with what was found, and what a number of the response is multiplied with.
+    Also the completed map, and the factor from the response's numbers to velocity.
     """
     mapping, file, assumed, name = source.mapping, source.file, source.assumed, response.channel
     values = source.column(name, "--response")
@@ -261,9 +270,9 @@ def _response(
             )
         phasor = values * np.exp(1j * source.phase(phase, "--phase"))
     sensor = sensor_of(response, mapping, number, assumed)
-    turn = velocity_factors([Channel(name, quantity)], [1], omega)[:, 0, 0]
+    to_velocity = velocity_factors([Channel(name, quantity)], [1], omega)[:, 0, 0]
     filled = response._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
-    return phasor * factor * turn, filled, factor * turn
+    return phasor * factor * to_velocity, filled, factor * to_velocity
 
 
 def sensor_of(response: ResponseMap, mapping: ImportMap, number: int, assumed: Assumptions) -> str:
@@ -276,7 +285,7 @@ def sensor_of(response: ResponseMap, mapping: ImportMap, number: int, assumed: A
 
 
 def _partner(source: _Source, channel: str) -> tuple[str, str]:
-    """The column of the imaginary part, or of the phase, by names: nothing unless it is one."""
+    """The column of the imaginary part or of the phase, by name; empty unless unique."""
     if role_of(channel) == "real":
         swapped = _swap(channel)
         if swapped in source.table.columns:
@@ -289,7 +298,7 @@ def _partner(source: _Source, channel: str) -> tuple[str, str]:
 
 
 def _swap(name: str) -> str:
-    """The name of an imaginary part beside that of a real part."""
+    """The name of the imaginary part that belongs to the name of a real part."""
     for old, new in (("real", "imag"), ("Real", "Imag"), ("re", "im"), ("Re", "Im")):
         swapped = re.sub(rf"(?<![A-Za-z]){old}(?![A-Za-z])|(?<=_){old}(?=_|$)", new, name)
         if swapped != name:
@@ -300,17 +309,17 @@ def _swap(name: str) -> str:
 
 
 def _refuse_doubled(source: _Source) -> None:
-    """Raise `ValueError` where one column is both what drives the structure and its response."""
+    """Raise `ValueError` where one column is both excitation and response."""
     for response in source.mapping.responses:
         if response.channel == source.mapping.load:
             raise ValueError(
-                f"{response.channel} of {source.file} is named as the response and as what drives "
-                "the structure: one column is one of the two."
+                f"{response.channel} of {source.file} is named both as the response and as the "
+                "excitation."
             )
 
 
 def _level(source: _Source) -> tuple[str, np.ndarray | None]:
-    """The rule for levels, and the numbers of a column where one has them."""
+    """The rule for levels, and the level column where there is one."""
     rule, columns = source.mapping.level, source.table.columns
     if rule in ("force", "runs", "file"):
         return rule, None
@@ -341,16 +350,18 @@ def _check(omega: Float[np.ndarray, " row"], force: Float[np.ndarray, " row"], f
             )
 
 
-# Standard deviations, as lock-in amplifiers list them.
+# Standard deviations as listed by lock-in amplifiers.
 
 
 def _with_errors_by_name(source: _Source, response: ResponseMap, number: int) -> ResponseMap:
-    """A response with the columns of its errors: those that are named after it and its phase."""
+    """A response with its error columns, those named after it and its phase."""
     phases = source.with_role("phase")
     phase = response.phase or (phases[0] if len(phases) == 1 else "")
     named_columns: dict[str, Any] = {}
     for key, of in {"amplitude_std": response.channel, "phase_std": phase}.items():
-        named = [name for name in source.with_role("deviation") if _bare(name) == _bare(of)]
+        named = [
+            name for name in source.with_role("deviation") if _base_name(name) == _base_name(of)
+        ]
         if of and not getattr(response, key) and len(named) == 1:
             named_columns[key] = named[0]
             source.assumed.add(f"response {number}.{key}", Fact("deviation_of_one_row"))
@@ -360,12 +371,12 @@ def _with_errors_by_name(source: _Source, response: ResponseMap, number: int) ->
 def _errors(
     source: _Source, response: ResponseMap, scale: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, "2 row"]:
-    """1σ of the velocity (m/s) and of the phase (rad) of every row; NaN where none is stated.
+    """1σ of the velocity (m/s) and of the phase (rad) of every row; NaN where not stated.
 
-    Arguments: `scale` is what an amplitude of the table is multiplied with; phases' errors have
+    Arguments: `scale` is the factor from the table's amplitudes to velocity; phase errors are in
     the unit of the phases.
     """
-    turn = 1.0 if _in_radians(source, response) else np.pi / 180
+    to_radians = 1.0 if _in_radians(source, response) else np.pi / 180
     of_level, name = response.channel in source.levels, response.amplitude_std
     is_level = bool(_DECIBELS.search(name)) or level_reference(source.unit(name)) is not None
     if name and of_level != is_level and (is_level or source.unit(name)):
@@ -373,11 +384,11 @@ def _errors(
             f"{name} of {source.file} must be standard deviations in the unit of "
             f"{response.channel}, but one of both is in dB: --amplitude-std names another column."
         )
-    if of_level:  # errors in dB, too
+    if of_level:  # δv = v δL ln(10)/20
         scale = scale * np.log(10) / 20 * np.abs(source.column(response.channel, "--response"))
     stated = (
         (response.amplitude_std, "--amplitude-std", scale),
-        (response.phase_std, "--phase-std", np.asarray(turn)),
+        (response.phase_std, "--phase-std", np.asarray(to_radians)),
     )
     missing = np.full(source.table.n_rows, np.nan)
     return np.stack(
@@ -386,16 +397,16 @@ def _errors(
 
 
 def _in_radians(source: _Source, response: ResponseMap) -> bool:
-    """Whether an error of the phase is in radians: as its name, its unit or the phase's says."""
+    """Whether a phase error is in radians, by its own unit or that of the phase."""
     of_phase = source.mapping.phase_unit or source.unit(response.phase)
     return (source.unit(response.phase_std) or of_phase).lower().startswith("rad")
 
 
-def _bare(name: str) -> str:
-    """A name in small letters without its unit and without a word for a deviation.
+def _base_name(name: str) -> str:
+    """A name in lower case without its unit and any word for a deviation.
 
-    >>> _bare("R"), _bare("R_std"), _bare("Theta [deg]"), _bare("ThetaDev"), _bare("phase_std_deg")
-    ('r', 'r', 'theta', 'theta', 'phase')
+    >>> [_base_name(text) for text in ("R", "R_std", "Theta [deg]", "ThetaDev", "phase_std_deg")]
+    ['r', 'r', 'theta', 'theta', 'phase']
     """
     return re.sub(r"[\s_.\-]", "", _DEVIATION.sub("", label_of(name).word.lower()))
 

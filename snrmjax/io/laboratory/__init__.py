@@ -1,4 +1,4 @@
-"""Files of laboratories: UFF, MATLAB, HDF5, netCDF, TDMS, CSV, read into recordings and tables."""
+"""Laboratory files (UFF, MATLAB, HDF5, netCDF, TDMS, CSV) read into recordings and tables."""
 
 import lazy_loader
 

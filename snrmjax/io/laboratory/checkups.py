@@ -1,4 +1,4 @@
-"""What the import doctor found, as JSON, and the records that it looks at."""
+"""Findings of the import check as JSON, and the records it examines."""
 
 import json
 
@@ -18,7 +18,7 @@ def write_checkup(path: FilePath, checkup: Checkup) -> None:
 
 
 def read_recordings(path: FilePath) -> tuple[TimeRecording, ...]:
-    """The time records of a laboratory's file. Raises `ValueError` where it holds none."""
+    """The time records of a laboratory's file. Raises `ValueError` where there are none."""
     recordings = read_laboratory_file(path).recordings
     if not recordings:
         raise ValueError(f"{file_name(path)} holds no time record.")

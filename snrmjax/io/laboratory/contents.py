@@ -1,4 +1,4 @@
-"""What a laboratory's file holds, whatever its format."""
+"""Contents of a laboratory file of any format."""
 
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
@@ -18,9 +18,9 @@ class NumberTable(NamedTuple):
     """Columns of numbers by name, all of one length.
 
     One row may be a steady state (frequency, force, amplitude, phase), a step of a record or a
-    line of a spectrum. Numbers are as they stand in the file, real or complex; NaN where a field is
-    empty. `units` has the file's own word for each column that states one, `words` the columns of
-    text (a sensor's name, a condition), "" where a field is empty.
+    line of a spectrum. Numbers are unchanged from the file, real or complex; NaN where a field is
+    empty. `units` are as written in the file, where stated; `words` has the columns of text (a
+    sensor's name, a condition), "" where a field is empty.
     """
 
     name: str
@@ -29,14 +29,14 @@ class NumberTable(NamedTuple):
     words: Mapping[str, tuple[str, ...]] = {}
 
     def role(self, name: str) -> str:
-        """What a column is, by its name and its unit; see `role_of`. Truth values are marks."""
+        """Role of a column, by name and unit; see `role_of`. Boolean columns are marks."""
         is_mark = self.columns[name].dtype == bool
         return "mark" if is_mark else role_of(name, self.units.get(name, ""))
 
     def with_named_units(self) -> "NumberTable":
-        """With the units that names of columns have in them, where the file states none."""
-        said = {name: column_unit(name, self.units.get(name, "")) for name in self.columns}
-        return self._replace(units={name: unit for name, unit in said.items() if unit})
+        """With units taken from column names where the file states none."""
+        units = {name: column_unit(name, self.units.get(name, "")) for name in self.columns}
+        return self._replace(units={name: unit for name, unit in units.items() if unit})
 
     @property
     def n_rows(self) -> int:
@@ -45,7 +45,7 @@ class NumberTable(NamedTuple):
 
 
 class TextFormat(NamedTuple):
-    """How a text is written; what is None is found out.
+    """Format of a text file; None is detected.
 
     `separator` is "comma", "semicolon", "tab" or "space", `decimal` "point" or "comma",
     `header_row` the row of the columns' names, from 1.
@@ -57,10 +57,10 @@ class TextFormat(NamedTuple):
 
 
 class LaboratoryFile(NamedTuple):
-    """All that a file of a laboratory holds; see `read_laboratory_file`.
+    """Contents of a laboratory file; see `read_laboratory_file`.
 
     `levels` has one number for each of `responses` (UFF: the value on the z axis), NaN where the
-    file states none. `notes` say what was not read, and what was taken for what.
+    file states none. `notes` report what was not read, and assumptions.
     """
 
     name: str
@@ -73,5 +73,5 @@ class LaboratoryFile(NamedTuple):
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing was found."""
+        """Whether the file has no data."""
         return not (self.recordings or self.responses or self.tables)

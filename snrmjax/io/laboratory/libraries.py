@@ -1,4 +1,4 @@
-"""Borders to the libraries of file formats: one sentence where one lacks or a file is damaged."""
+"""Access to file-format libraries: clear errors for missing packages and damaged files."""
 
 import importlib
 from collections.abc import Iterator
@@ -7,9 +7,9 @@ from typing import Any
 
 
 def library(module: str, purpose: str) -> Any:
-    """A library of the extra `lab`, imported where it is first needed.
+    """A library of the extra `lab`, imported when first needed.
 
-    Raises `ValueError` with the command that installs it; `purpose` says what needs it.
+    Raises `ValueError` with the command that installs it; `purpose` is named in the message.
     """
     try:
         return importlib.import_module(module)
@@ -22,13 +22,13 @@ def library(module: str, purpose: str) -> Any:
 
 @contextmanager
 def damaged_if_it_fails(file: str, what: str) -> Iterator[None]:
-    """Whatever a library raises about a file becomes a `ValueError` that names the file.
+    """Turn any exception of a library into a `ValueError` that names the file.
 
-    Only calls of libraries stand inside: each has errors of its own (struct, zlib, HDF5, …).
+    Enclose only library calls: each raises its own errors (struct, zlib, HDF5, …).
     """
     try:
         yield
     except Exception as error:
-        said = " ".join(str(error).split())
-        why = f" ({said[:160]})" if said else f" ({type(error).__name__})"
+        message = " ".join(str(error).split())
+        why = f" ({message[:160]})" if message else f" ({type(error).__name__})"
         raise ValueError(f"{file} is damaged or is not {what}{why}.") from error

@@ -1,15 +1,15 @@
-"""What the names of columns and variables say in laboratories of several languages."""
+"""Interpretation of column and variable names in several languages."""
 
 import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
 from snrmjax.io.laboratory.physical_units import (
+    amplitude_words_removed,
     level_reference,
-    size_words_removed,
     unit_in_table,
     unit_meaning,
-    without_size,
+    without_amplitude_kind,
 )
 
 _QUANTITIES = ("force", "drive", "displacement", "velocity", "acceleration", "frequency", "time")
@@ -39,25 +39,25 @@ _ROLES = {
 }
 _COMPILED = {role: re.compile(pattern, re.IGNORECASE) for role, pattern in _ROLES.items()}
 
-# Of which dimension the unit is of what a name calls.
+# Dimensions of the units that fit each role.
 _FITTING = {
     **{motion: (motion,) for motion in ("displacement", "velocity", "acceleration")},
     **{"time": ("time",), "step": ("time",), "rate": ("frequency",), "frequency": ("frequency",)},
     **{"phase": ("angle",), "force": ("force",), "drive": ("voltage", "force"), "coherence": ()},
 }
-_SYMBOLS = {"f": ("frequency", "force"), "w": ("frequency",)}  # which may be a deflection, too
-# Times are called so, and volts are of every sensor.
-_TOLD_BY_UNIT = ("force", "displacement", "velocity", "acceleration", "frequency", "angle")
-# Units that are words or letters of another meaning: inch, left bottom, radial, gradient, gain.
+_SYMBOLS = {"f": ("frequency", "force"), "w": ("frequency",)}  # w may be a deflection, too
+# Without time, which is stated by name, and voltage, which any sensor may have.
+_KNOWN_BY_UNIT = ("force", "displacement", "velocity", "acceleration", "frequency", "angle")
+# Units that also mean something else: in, left bottom, radial, gradient, gain.
 _WORDS = ("in", "lb", "lbs", "gs", "gn", "kp", "rad", "Grad", "mil", "mils", "thou", "ft", "foot")
-_ALONE = ("N", "rad", "Grad")  # of these and of letters, those that a whole name may be
+_ALONE = ("N", "rad", "Grad")  # of these and of single letters, the ones accepted as a whole name
 
 _BOUNDARY = re.compile(
     r"\s(?:in|en)\s+|[\s_/,.\-]+|(?<=[a-z0-9])(?=[A-Z])|(?<=[a-zA-Z])(?=°)"
     r"|(?<=[a-fh-z])(?=(?:deg|rad|hz)$)"
 )
 _IN_BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\[\]]*)\]|\(((?:[^()]|\([^()]*\))*)\))$")
-_DATE = re.compile(r"[0-9]+[-/.:][0-9]+[-/.:]|[0-9]:[0-9]")  # and times of day: no units
+_DATE = re.compile(r"[0-9]+[-/.:][0-9]+[-/.:]|[0-9]:[0-9]")  # dates and times of day are no units
 
 # Levels: "vel_dB", "Mag [dB re 1 m/s]", "20*log10(|v|)".
 _LEVEL = re.compile(r"(?<![^\W\d_])(?:d[Bb]|DB|[Dd]ecibels?)(?:V|u|[mµu]V)?(?!\w).*$|(?<=[a-z])dB$")
@@ -71,7 +71,7 @@ _BASE = re.compile(
 
 
 def is_of_base(name: str) -> bool:
-    """Whether a name says that something is of a moving base: a shaker's table, a control channel.
+    """Whether a name is that of a base motion: a shaker table, a control channel.
 
     >>> is_of_base("Control [g]"), is_of_base("table_acc"), is_of_base("tip")
     (True, True, False)
@@ -80,7 +80,7 @@ def is_of_base(name: str) -> bool:
 
 
 class Label(NamedTuple):
-    """The name of a column in two: what it is called, and the unit that stands in it or nothing."""
+    """A column's name split into the word and its unit, if any."""
 
     word: str
     unit: str = ""
@@ -88,27 +88,27 @@ class Label(NamedTuple):
 
 
 def label_of(name: str) -> Label:
-    """The unit that a name has in brackets behind it, as its ending, or that it is.
+    """Split a name into word and unit: in brackets, as ending, or the whole name.
 
-    What brackets hold is a unit. An ending is one where it can mean nothing else: the word before
-    it calls the same quantity ("acc_g", "force_n"), or says of none, and the unit is no letter or
-    word of another meaning ("tip_mm", but not "ref_m", "x_max_in", "v_rad").
+    Text in brackets is a unit. An ending is a unit only if unambiguous: the word before it names
+    the same quantity ("acc_g", "force_n") or none, and then the unit is not a letter or word of
+    another meaning ("tip_mm", but not "ref_m", "x_max_in", "v_rad").
 
     >>> label_of("Kraft eff. (N)")[:2], label_of("vel_mm_s")[:2], label_of("f/Hz")[:2]
     (('Kraft eff.', 'N'), ('vel', 'mm/s'), ('f', 'Hz'))
     >>> label_of("mm/s")[:2], label_of("g")[:2], label_of("acc_mm_s")[:2]
     (('', 'mm/s'), ('g', ''), ('acc_mm_s', ''))
     """
-    plain, size = without_size(name.strip())
+    plain, amplitude = without_amplitude_kind(name.strip())
     if (level := _level_of(name.strip())) is not None:
         return level
     match = _IN_BRACKETS.match(plain)
     if match and _DATE.search(match[2] or match[3] or ""):
         return Label(name.strip())
     if match:
-        word = f"{match[1].rstrip(' /,_-')} {size}".strip()
+        word = f"{match[1].rstrip(' /,_-')} {amplitude}".strip()
         return Label(word, (match[2] or match[3] or "").strip(), True)
-    for start, end in [(0, 0), *(found.span() for found in _BOUNDARY.finditer(plain))]:
+    for start, end in [(0, 0), *(boundary.span() for boundary in _BOUNDARY.finditer(plain))]:
         word, ending = plain[:start], plain[end:]
         unit = unit_in_table(ending)
         if not unit and len(word) > 1 and len(ending) == 1:  # as in our own "force_n"
@@ -116,15 +116,15 @@ def label_of(name: str) -> Label:
         if not unit:
             continue
         if _is_unit_of(word, unit):
-            return Label(f"{word} {size}".strip(), unit)
-        # What stands here is another unit (N_m), unless its first letter is a symbol: A_mm.
-        if word or not _called(_BOUNDARY.split(plain)[0]):
+            return Label(f"{word} {amplitude}".strip(), unit)
+        # The ending belongs to a composite unit (N_m), unless the first letter is a symbol: A_mm.
+        if word or not _role_by_name(_BOUNDARY.split(plain)[0]):
             break
     return Label(name.strip())
 
 
 def column_unit(name: str, stated: str) -> str:
-    """The unit of a column: stated, or in its name. A name that says dB is believed before others.
+    """The unit of a column: stated, or in its name. dB in the name takes precedence.
 
     >>> column_unit("vel_mm_s", ""), column_unit("vel", "mm/s"), column_unit("vel_dB", "mm/s")
     ('mm/s', 'mm/s', 'dB')
@@ -135,11 +135,11 @@ def column_unit(name: str, stated: str) -> str:
 
 
 def _level_of(name: str) -> Label | None:
-    """A name of a level in two, as "vel" and "dB re 1 m/s", or None: of no level."""
-    found = _LEVEL.search(name)
-    if found is None:
+    """A level's name split, as "vel" and "dB re 1 m/s"; None for no level."""
+    match = _LEVEL.search(name)
+    if match is None:
         return Label(name, "dB") if _LOGARITHM.search(name) else None
-    word, unit = name[: found.start()].rstrip(), found[0]
+    word, unit = name[: match.start()].rstrip(), match[0]
     is_bracketed = word.endswith(("(", "["))
     if is_bracketed:
         unit = unit.rpartition(")" if word.endswith("(") else "]")[0] or unit
@@ -150,11 +150,11 @@ def _level_of(name: str) -> Label | None:
 
 
 def _is_unit_of(word: str, unit: str) -> bool:
-    """Whether an ending is the unit of what the word before it calls, or of one that says little.
+    """Whether an ending is a unit that fits the word before it, or the word names no quantity.
 
-    A voltage stands for the generator's signal alone: that of a sensor leaves its scale open.
+    A voltage fits only the drive signal: for a sensor it leaves the sensitivity open.
     """
-    meaning, role = unit_meaning(unit), _called(word)
+    meaning, role = unit_meaning(unit), _role_by_name(word)
     is_symbol = word.lower() in _SYMBOLS
     fitting = _SYMBOLS.get(word.lower()) or _FITTING.get(role) or ()
     if meaning.per_volt or (meaning.per_force and not word):
@@ -164,37 +164,37 @@ def _is_unit_of(word: str, unit: str) -> bool:
     if role in _FITTING and role != "drive" and not is_symbol:
         return False
     is_plain = (len(unit) > 1 and unit not in _WORDS) or unit == "°"
-    return meaning.dimension in _TOLD_BY_UNIT and (is_plain or (not word and unit in _ALONE))
+    return meaning.dimension in _KNOWN_BY_UNIT and (is_plain or (not word and unit in _ALONE))
 
 
 def role_of(name: str, unit: str = "") -> str:
-    """What a column is: by its name or, where that says little, by its unit; or nothing.
+    """Role of a column by its name or, where that is unknown, by its unit; or empty.
 
-    A name says "frequency", "force", "phase", "time", … It may be a path ("data.freq") and have a
-    unit in it (`label_of`). A unit says "frequency", "phase", "time", "force", "drive" (volts) or
-    which motion it is, and is believed before a name that says another of these quantities.
-    Arguments: `unit` as the file states it elsewhere, which wins over that of the name.
+    Roles by name are "frequency", "force", "phase", "time", … The name may be a path ("data.freq")
+    and contain a unit (`label_of`). Roles by unit are "frequency", "phase", "time", "force",
+    "drive" (volts) or a motion; they take precedence over a contradicting name.
+    Arguments: `unit` as stated elsewhere in the file, which takes precedence over the name's.
 
     >>> role_of("data.Frequency [Hz]"), role_of("Kraft (N)"), role_of("fs"), role_of("qwe")
     ('frequency', 'force', 'rate', '')
     """
     label = label_of(name)
-    by_name = _called(label.word)
+    by_name = _role_by_name(label.word)
     try:
         stated = unit or label.unit
         meaning = unit_meaning(level_reference(stated) or stated)
     except ValueError:
         return by_name
     by_unit = _BY_UNIT.get(meaning.dimension, "")
-    is_drive = by_unit == "drive" and by_name != "drive"  # a sensor's volts are volts, too
+    is_drive = by_unit == "drive" and by_name != "drive"  # any sensor may be in volts
     plain = not by_name or (by_name in _QUANTITIES and by_unit in _QUANTITIES)
     return by_unit if by_unit and plain and not is_drive else by_name
 
 
 def listed_name(name: str, units: Mapping[str, str]) -> str:
-    """The name in a list of columns of one that may be as the file has it, its unit in brackets.
+    """The listed name of a column that may be given as in the file, with its unit in brackets.
 
-    Arguments: `units` has the names that are listed, with the unit of each or "".
+    Arguments: `units` of the listed names, "" where unknown.
 
     >>> listed_name("Kraft (N)", {"Kraft": "N"}), listed_name("Kraft (N)", {"Kraft": "V"})
     ('Kraft', 'Kraft (N)')
@@ -204,9 +204,9 @@ def listed_name(name: str, units: Mapping[str, str]) -> str:
     return label.word if known and name not in units else name
 
 
-def _called(word: str) -> str:
-    """What a name without its unit calls."""
-    last = size_words_removed(word).strip(" ._-").rsplit(".", 1)[-1]
+def _role_by_name(word: str) -> str:
+    """Role of a name without its unit, or empty."""
+    last = amplitude_words_removed(word).strip(" ._-").rsplit(".", 1)[-1]
     plain = re.sub(r"[\s\-'’]+", "_", last.strip())[:60]
     if plain == "F":  # f is a frequency
         return "force"

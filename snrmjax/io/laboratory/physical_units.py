@@ -1,4 +1,4 @@
-"""Units as laboratories write them, and what they mean in SI."""
+"""Units as written in laboratory files, converted to SI."""
 
 import ast
 import functools
@@ -20,17 +20,18 @@ _AS_PYTHON = str.maketrans(
 )
 _NOTHING = {"", "-", "--", "1", "eu", "none", "unknown", "n/a", "na", "a.u."}
 _ODD = re.compile(r"[0-9.]{2,}|\^\s*[^-1-9(]|\*\*|\^.*\^.*\^")
-_SIZES = {
+_AMPLITUDE_KINDS = {
     "peak_to_peak": r"pk[-_ ]?pk|p[-_ ]?p|p2p|peak[-_ ]?to[-_ ]?peak|cr[eê]te[-_ ][aà][-_ ]cr[eê]te"
     r"|spitze[-_ ]spitze",
     "rms": r"rms|eff(?:ektiv[a-z]*|icace)?",
     "peak": r"pk|peak|cr[eê]te|spitzen?[a-z]*|scheitel[a-z]*",
 }
-_SIZE = "|".join(f"(?P<{size}>{words})" for size, words in _SIZES.items())
-_SIZE = rf"(?:(?<![^\W\d_])|(?<=V))(?:{_SIZE})(?![^\W\d_])\.?"
-_A_SIZE = re.compile(_SIZE, re.IGNORECASE)
-_SIZED = re.compile(
-    rf"[\s_,]*(?:(?P<round>\()|(?P<square>\[))?{_SIZE}(?(round)\)|(?(square)\]))$", re.IGNORECASE
+_AMPLITUDE = "|".join(f"(?P<{kind}>{words})" for kind, words in _AMPLITUDE_KINDS.items())
+_AMPLITUDE = rf"(?:(?<![^\W\d_])|(?<=V))(?:{_AMPLITUDE})(?![^\W\d_])\.?"
+_AMPLITUDE_WORD = re.compile(_AMPLITUDE, re.IGNORECASE)
+_AMPLITUDE_SUFFIX = re.compile(
+    rf"[\s_,]*(?:(?P<round>\()|(?P<square>\[))?{_AMPLITUDE}(?(round)\)|(?(square)\]))$",
+    re.IGNORECASE,
 )
 
 _LEVEL = re.compile(
@@ -56,7 +57,7 @@ _DIMENSIONS: dict[str, _Powers] = {
     "mass": (0, 1, 0, 0, 0),
 }
 _PI = "3.141592653589793238462643383279502884"
-# Spellings, size in SI, powers. In vibration tests g is gravity, never gram, and lb a force.
+# Spellings, factor to SI, powers. In vibration tests g is gravity, never gram, and lb a force.
 _KNOWN: tuple[tuple[str, Decimal, _Powers], ...] = (
     ("m meter metre", Decimal(1), _DIMENSIONS["displacement"]),
     ("in inch", Decimal("0.0254"), _DIMENSIONS["displacement"]),
@@ -81,7 +82,7 @@ _KNOWN: tuple[tuple[str, Decimal, _Powers], ...] = (
     ("Pa pascal", Decimal(1), (-1, 1, -2, 0, 0)),
     ("1", Decimal(1), (0, 0, 0, 0, 0)),
 )
-_UNITS = {name: (size, powers) for names, size, powers in _KNOWN for name in names.split()}
+_UNITS = {name: (factor, powers) for names, factor, powers in _KNOWN for name in names.split()}
 _ALONE = {"1", "G", "gs", "ips", "mils", "lb", "lbs", "h", "min"}  # without a prefix
 _GRAM = (Decimal("0.001"), _DIMENSIONS["mass"])
 _PREFIXES = {
@@ -89,9 +90,9 @@ _PREFIXES = {
     **{"nano": -9, "micro": -6, "milli": -3, "centi": -2, "kilo": 3, "mega": 6},
 }
 _SPELLED = {
-    prefix + name: (size.scaleb(power), powers)
+    prefix + name: (factor.scaleb(power), powers)
     for prefix, power in reversed(_PREFIXES.items())
-    for name, (size, powers) in (_UNITS | {"g": _GRAM}).items()
+    for name, (factor, powers) in (_UNITS | {"g": _GRAM}).items()
     if name not in _ALONE
 } | _UNITS
 _MOTIONS = ("displacement", "velocity", "acceleration")
@@ -99,18 +100,18 @@ _WITH_VOLTS = ("force", *_MOTIONS)
 
 
 class UnitMeaning(NamedTuple):
-    """What a unit says: a number in it times `factor` is in the SI unit of `dimension`.
+    """Meaning of a unit: a number in it times `factor` is in the SI unit of `dimension`.
 
     `dimension` is a quantity of a channel, or "frequency" (SI unit rad/s), "angle" (rad), "time",
-    "mass", "other". Of a sensitivity ("10.2 mV/g") it is the quantity that volts stand for, and
-    `per_volt` is true; of a motion over a force ("g/N", "(1/lbf)*(m/s^2)") it is the motion,
-    `factor` is in its SI unit per newton, and `per_force` is true. `size` is what a suffix says
-    ("g rms"): "rms", "peak", "peak_to_peak", or nothing.
+    "mass", "other". For a sensitivity ("10.2 mV/g") it is the measured quantity, and `per_volt`
+    is true; for a motion per force ("g/N", "(1/lbf)*(m/s^2)") it is the motion, `factor` is in its
+    SI unit per newton, and `per_force` is true. `amplitude` is the suffix ("g rms"): "rms", "peak",
+    "peak_to_peak", or empty.
     """
 
     dimension: str
     factor: float
-    size: str = ""
+    amplitude: str = ""
     per_volt: bool = False
     per_force: bool = False
 
@@ -123,11 +124,11 @@ class UnitMeaning(NamedTuple):
 
 @functools.lru_cache(maxsize=1024)
 def unit_meaning(text: str) -> UnitMeaning:
-    """What a unit means: "N", "m/s²", "g" (gravity), "in/s", "lbf", "10.2 mV/g", "mm/s rms".
+    """Meaning of a unit: "N", "m/s²", "g" (gravity), "in/s", "lbf", "10.2 mV/g", "mm/s rms".
 
-    An empty text, "EU" and "-" are of unknown dimension with the factor 1. Units beyond those of
-    the table in this module are Pint's, where it is installed.
-    Raises `ValueError` for what is no unit.
+    An empty text, "EU" and "-" are of unknown dimension with the factor 1. Other units than those
+    of the table in this module are Pint's, if installed.
+    Raises `ValueError` for a text that is no unit.
 
     >>> unit_meaning("g").factor, unit_meaning("mm/s").dimension
     (9.80665, 'velocity')
@@ -139,8 +140,8 @@ def unit_meaning(text: str) -> UnitMeaning:
         return UnitMeaning("unknown", 1.0)
     if len(plain) > _LONGEST or not _ALLOWED.fullmatch(plain):
         raise _not_understood(text)
-    plain, tail = without_size(plain)
-    size = size_of(tail)
+    plain, tail = without_amplitude_kind(plain)
+    amplitude = amplitude_kind(tail)
     number = _NUMBER.match(plain)
     value = float(number[1]) if number else 1.0
     if number:
@@ -151,24 +152,24 @@ def unit_meaning(text: str) -> UnitMeaning:
     factor, powers = _parsed(plain, text)
     for dimension in _WITH_VOLTS:
         if powers[:4] == _product(_VOLT, _DIMENSIONS[dimension], -1)[:4]:
-            return UnitMeaning(dimension, 1 / (value * factor), size, True)
+            return UnitMeaning(dimension, 1 / (value * factor), amplitude, True)
         if powers[:4] == _product(_DIMENSIONS[dimension], _VOLT, -1)[:4]:
-            return UnitMeaning(dimension, value * factor, size, True)
+            return UnitMeaning(dimension, value * factor, amplitude, True)
     for dimension in _MOTIONS:
         ratio = _product(_DIMENSIONS[dimension], _DIMENSIONS["force"], -1)
         if powers[:4] == ratio[:4]:
-            return UnitMeaning(dimension, value * factor, size, per_force=True)
+            return UnitMeaning(dimension, value * factor, amplitude, per_force=True)
     alike = (name for name, of in _DIMENSIONS.items() if powers[:4] == of[:4])
     dimension = next(alike, "other")
     if dimension == "frequency" and not powers[4]:
         factor *= 2 * math.pi
     if dimension == "angle" and not powers[4]:
         dimension = "other"
-    return UnitMeaning(dimension, value * factor, size)
+    return UnitMeaning(dimension, value * factor, amplitude)
 
 
 def level_reference(text: str) -> str | None:
-    """The reference of a level in dB as a unit, "" where none is understood, None for no level.
+    """The reference of a level in dB as a unit, "" if unknown, None if no level.
 
     >>> [level_reference(unit) for unit in ("dB re 1e-9 m/s", "dB (ref. g/N)", "dBV", "dB", "m/s")]
     ['1e-9 m/s', 'g/N', '1 V rms', '', None]
@@ -187,39 +188,39 @@ def level_reference(text: str) -> str | None:
     return f"{reference} {match['size'] or ''}".strip()
 
 
-def size_of(text: str) -> str:
-    """What a unit or a name says of the size of amplitudes: "rms", "peak", "peak_to_peak", or "".
+def amplitude_kind(text: str) -> str:
+    """Kind of amplitudes stated by a unit or a name: "rms", "peak", "peak_to_peak", or "".
 
-    >>> size_of("N rms"), size_of("Kraft eff."), size_of("v_pk_pk"), size_of("effort")
-    ('rms', 'rms', 'peak_to_peak', '')
+    >>> [amplitude_kind(text) for text in ("N rms", "Kraft eff.", "v_pk_pk", "effort")]
+    ['rms', 'rms', 'peak_to_peak', '']
     """
-    match = _A_SIZE.search(text)
+    match = _AMPLITUDE_WORD.search(text)
     return (match.lastgroup or "") if match else ""
 
 
-def without_size(text: str) -> tuple[str, str]:
-    """A unit or a name without the word for a size of amplitudes at its end, and that word.
+def without_amplitude_kind(text: str) -> tuple[str, str]:
+    """A unit or a name without the amplitude kind at its end, and that word.
 
-    >>> without_size("Kraft (N) eff."), without_size("mm/s [rms]"), without_size("Kraft (N eff)")
-    (('Kraft (N)', 'eff.'), ('mm/s', '[rms]'), ('Kraft (N eff)', ''))
+    >>> [without_amplitude_kind(text) for text in ("Kraft (N) eff.", "mm/s [rms]", "Kraft (N eff)")]
+    [('Kraft (N)', 'eff.'), ('mm/s', '[rms]'), ('Kraft (N eff)', '')]
     """
-    match = _SIZED.search(text)
+    match = _AMPLITUDE_SUFFIX.search(text)
     return (text[: match.start()].strip(), match[0].strip(" _,")) if match else (text, "")
 
 
-def size_words_removed(text: str) -> str:
-    """A name without the words for a size of amplitudes, wherever they stand.
+def amplitude_words_removed(text: str) -> str:
+    """A name without all words for an amplitude kind.
 
-    >>> size_words_removed("F_eff"), size_words_removed("rms force")
+    >>> amplitude_words_removed("F_eff"), amplitude_words_removed("rms force")
     ('F_', ' force')
     """
-    return _A_SIZE.sub("", text)
+    return _AMPLITUDE_WORD.sub("", text)
 
 
 def unit_in_table(text: str) -> str:
-    """An ending of a name as a unit of the table in this module, for `unit_meaning`; or nothing.
+    """A name's ending as a unit of the table in this module, for `unit_meaning`; empty if none.
 
-    Pint's thousands of words are no endings: point and hand are units of its. "_" stands for "/".
+    Pint's units are excluded, since they include words like point and hand. "_" means "/".
 
     >>> unit_in_table("mm_s"), unit_in_table("Deg"), unit_in_table("m/s²"), unit_in_table("point")
     ('mm/s', 'deg', 'm/s²', '')
@@ -240,7 +241,7 @@ def unit_in_table(text: str) -> str:
 def channel_meaning(text: str) -> tuple[Quantity, float]:
     """Quantity and calibration of a channel whose file states a unit; unknown where unreadable.
 
-    Of a motion over a force they are those of the motion, per newton.
+    For a motion per force they are those of the motion, per newton.
     """
     try:
         meaning = unit_meaning(text)
@@ -252,7 +253,7 @@ def channel_meaning(text: str) -> tuple[Quantity, float]:
 
 
 def is_per_force(text: str) -> bool:
-    """Whether a unit is that of a motion over a force, as "g/N"."""
+    """Whether a unit is a motion per force, as "g/N"."""
     try:
         return unit_meaning(text).per_force
     except ValueError:
@@ -264,7 +265,7 @@ def _not_understood(text: str, why: str = "") -> ValueError:
 
 
 def _product(first_powers: _Powers, other: _Powers, power: int) -> _Powers:
-    """The powers of `one` times `other` to a power."""
+    """The powers of a product of `first_powers` and `other` to a power."""
     first, second, third, fourth, fifth = (
         a + power * b for a, b in zip(first_powers, other, strict=True)
     )
@@ -272,22 +273,22 @@ def _product(first_powers: _Powers, other: _Powers, power: int) -> _Powers:
 
 
 def _parsed(plain: str, text: str) -> tuple[float, _Powers]:
-    """Size in SI and powers of a unit without number and suffix."""
+    """Factor to SI and powers of a unit without number and suffix."""
     words = plain.translate(_AS_PYTHON)
     words = re.sub(r"(?<=[A-Za-z])\^?(-?[1-9])(?![0-9])", r"^\1", words)
-    # pC/N has the dimension of m/V: a charge needs its amplifier's gain, and is no voltage.
+    # pC/N has the dimension of m/V, but a charge needs the amplifier's gain: refused.
     if re.search(r"(?<![A-Za-z])[a-z]?C(?![A-Za-z])", words) or _ODD.search(words):
         raise _not_understood(text)
     times = re.sub(r"(?<=[\w)])\s+(?=[\w(])", "*", words.strip())
-    named = re.sub(r"[^\W\d]+", r"u_\g<0>", times).replace("^", "**")  # "in" is Python's own word
+    named = re.sub(r"[^\W\d]+", r"u_\g<0>", times).replace("^", "**")  # "in" is a Python keyword
     try:
-        size, powers = _evaluated(ast.parse(named, mode="eval").body)
+        scale, powers = _evaluated(ast.parse(named, mode="eval").body)
     except ImportError as error:
         needed = " without the package pint (pip install 'snrmjax[lab]')"
         raise _not_understood(text, needed) from error
     except Exception as error:  # Pint has many, AssertionError and tokenize's among them
         raise _not_understood(text) from error
-    factor = float(size)
+    factor = float(scale)
     if not (math.isfinite(factor) and factor > 0):
         raise _not_understood(text)
     return factor, powers
@@ -301,24 +302,24 @@ def _evaluated(node: ast.expr) -> tuple[Decimal, _Powers]:
         case ast.Constant(value=1):
             return Decimal(1), (0, 0, 0, 0, 0)
         case ast.BinOp(op=ast.Mult() | ast.Div() as op, left=left, right=right):
-            (size, powers), (other, others) = _evaluated(left), _evaluated(right)
+            (scale, powers), (other, others) = _evaluated(left), _evaluated(right)
             sign = 1 if isinstance(op, ast.Mult) else -1
-            return size * other**sign, _product(powers, others, sign)
+            return scale * other**sign, _product(powers, others, sign)
         case ast.BinOp(op=ast.Pow(), left=left, right=right):
-            size, powers = _evaluated(left)
+            scale, powers = _evaluated(left)
             exponent = ast.literal_eval(right)
-            return size**exponent, _product((0, 0, 0, 0, 0), powers, exponent)
+            return scale**exponent, _product((0, 0, 0, 0, 0), powers, exponent)
     raise ValueError("neither a product nor a power of units")
 
 
 def _in_another_case(name: str) -> str:
-    """The only unit without a prefix that is spelled so but for its case: "Deg", "HZ"; or none."""
+    """The unique unit without prefix that matches except for case: "Deg", "HZ"; empty if none."""
     alike = [known for known in _UNITS if len(known) > 1 and known.lower() == name.lower()]
     return alike[0] if len({_UNITS[known] for known in alike}) == 1 else ""
 
 
 def _unit(name: str) -> tuple[Decimal, _Powers]:
-    """A unit by name, with a prefix or in the plural; one that the table lacks by Pint."""
+    """A unit by name, with prefix or plural; by Pint if not in the table."""
     singular = name[:-1] if len(name) > 3 and name[-1] == "s" else name
     for word in (name, singular, _in_another_case(name)):
         if word in _SPELLED:
@@ -326,8 +327,8 @@ def _unit(name: str) -> tuple[Decimal, _Powers]:
     base = _registry().Quantity(Decimal(1), _registry().parse_units(name)).to_base_units()
     of = {str(key).strip("[]"): int(power) for key, power in base.dimensionality.items()}
     length, mass, time, current = (of.pop(key, 0) for key in ("length", "mass", "time", "current"))
-    turns = int("radian" in str(base.units))
-    return base.magnitude, (0, 0, 0, 0, 0) if of else (length, mass, time, current, turns)
+    radians = int("radian" in str(base.units))
+    return base.magnitude, (0, 0, 0, 0, 0) if of else (length, mass, time, current, radians)
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""The sampling rate of times or of a step that were printed with few digits."""
+"""The sampling rate from times or a time step printed with few digits."""
 
 import math
 from typing import NamedTuple
@@ -8,27 +8,26 @@ from jaxtyping import Float, Int
 
 from snrmjax.numerics.facts import Fact
 
-_MOST_DIGITS = 12  # more are those of a computation, not of a print
-_ROUND_STEP = 3  # digits of a step that somebody may have chosen
-_ROUNDED = 1e-5  # relative, of a rate, which digits may leave open without a word
-_FEW_DIGITS = 0.02  # likewise, which is too much to be an even time
+_MOST_DIGITS = 12  # more digits come from a computation, not from printing
+_ROUND_STEP = 3  # digits of a step that a user may have chosen
+_ROUNDED = 1e-5  # relative uncertainty of a rate that needs no note
+_FEW_DIGITS = 0.02  # relative uncertainty above which the times are uneven
 _HALVINGS = 60
 
 
 class PrintedRate(NamedTuple):
-    """A sampling rate (Hz) and a note where that is not simply the one that is printed."""
+    """A sampling rate (Hz), with a note where it was inferred."""
 
     rate: float
     note: Fact | None = None
 
 
 def rate_between(lowest: float, highest: float, word: str, step: float = 0.0) -> PrintedRate:
-    """The sampling rate (Hz) of which digits say only that it lies between two.
+    """The sampling rate (Hz) that printed digits bound by two values.
 
-    It is the only whole rate there, or that of the round `step` (s) where one is stated that lies
-    there, too, and no whole rate does. Else it stays the middle, with a note that says what is left
-    open and which rate is the roundest.
-    Arguments: `word` is the step as it is printed.
+    The unique whole rate in the interval or, without one, the rate of the round `step` (s) if it is
+    inside; else the middle, with a note on the uncertainty and the roundest rate inside.
+    Arguments: `word` is the step as printed.
     """
     least, most = math.ceil(lowest * (1 - 1e-12)), math.floor(highest * (1 + 1e-12))
     middle = 2 / (1 / lowest + 1 / highest)
@@ -45,25 +44,25 @@ def rate_between(lowest: float, highest: float, word: str, step: float = 0.0) ->
 
 
 def _roundness(rate: int) -> int:
-    """The largest power of two or of ten that divides a rate: rates are most often of these."""
+    """The largest power of two or ten that divides a rate; usual rates have large ones."""
     return max(rate & -rate, 10 ** (len(str(rate)) - len(str(rate).rstrip("0"))))
 
 
 def rate_of_printed_times(
     time: Float[np.ndarray, " row"], at: Int[np.ndarray, " row"] | None = None, unit: float = 1.0
 ) -> PrintedRate | None:
-    """The rate (Hz) of times that are even but for the digits that they are printed with, or None.
+    """The rate (Hz) of times that are even to their printed digits, or None.
 
-    A time has at most as many decimals and as many significant digits as any of them; it was
-    rounded or cut there. With t₀ + kΔ within these of every time, Δ lies between two steps.
-    Arguments: `at` are the numbers k of the samples, all in order by default; `unit` of the times
+    All times share the largest numbers of decimals and significant digits that occur, and are
+    rounded or truncated there. t₀ + kΔ within that resolution of every time bounds Δ.
+    Arguments: `at` are the sample indices k, all in order by default; `unit` of the times
     in s.
     """
     at = np.arange(len(time)) if at is None else at
     resolution = _resolution(time)
     if resolution is None or not at[-1] > at[0]:
         return None
-    for rounded in (0.5, 1.0):  # or cut
+    for rounded in (0.5, 1.0):  # rounded, or truncated
         low, high = time - rounded * resolution, time + rounded * resolution
         steps = _steps_between(low, high, at)
         if steps is not None:
@@ -79,7 +78,7 @@ def rate_of_printed_times(
 
 
 def _resolution(time: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"] | None:
-    """The unit of the last digit of every time, or None: they have too many digits for a print."""
+    """The unit of the last digit of every time; None if there are too many digits for a print."""
     significant, decimals = 1, 0
     for value in time.tolist():
         plain = f"{value:.{_MOST_DIGITS}e}"
@@ -89,8 +88,8 @@ def _resolution(time: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"] | 
         count = len(mantissa.replace("-", "").replace(".", "").rstrip("0"))
         significant = max(significant, count)
         decimals = max(decimals, count - 1 - int(power))
-    size = np.abs(time)
-    exponent = np.floor(np.log10(size, out=np.full(len(time), -300.0), where=size > 0))
+    magnitude = np.abs(time)
+    exponent = np.floor(np.log10(magnitude, out=np.full(len(time), -300.0), where=magnitude > 0))
     return np.maximum(10.0**-decimals, 10.0 ** (exponent - significant + 1))
 
 
@@ -99,7 +98,7 @@ def _steps_between(
 ) -> tuple[float, float] | None:
     """The least and the largest step Δ with low ≤ t₀ + kΔ ≤ high for some t₀, or None.
 
-    max(low − kΔ) − min(high − kΔ) is convex in Δ and not above zero for those.
+    max(low − kΔ) − min(high − kΔ) is convex in Δ and ≤ 0 exactly for these steps.
     """
     span = float(at[-1] - at[0])
     slack = 1e-9 * float(np.max(high - low))

@@ -1,4 +1,4 @@
-"""One reader for every file of a laboratory: its content decides, then its extension."""
+"""One reader for all laboratory files: the format follows from content, then extension."""
 
 import importlib
 from pathlib import Path
@@ -22,7 +22,7 @@ _READERS: dict[Kind, tuple[str, str]] = {
 }
 _OF_ARRAYS = ("matlab", "octave", "hdf5")
 _HEAD = 4096
-_MOST_REASONS = 6  # notes that say why nothing was read
+_MOST_REASONS = 6  # notes listed where nothing was read
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -32,25 +32,25 @@ def read_laboratory_file(
     """All recordings, frequency responses and tables of a file.
 
     Formats: UFF/UNV (58, 58b), MATLAB v4 to v7.3, Octave's text, HDF5, netCDF 4, TDMS, LabVIEW
-    measurement files, and CSV or other separated text. Long records are not read before they are
-    asked for (HDF5, netCDF, MATLAB v7.3, TDMS).
-    Arguments: `text_format` says how a CSV is written where that is not found out by itself; `axis`
-    is that of matrices of responses (MATLAB, Octave, HDF5) without a vector of frequencies.
+    measurement files, and CSV or other separated text. Long records are read on demand
+    (HDF5, netCDF, MATLAB v7.3, TDMS).
+    Arguments: `text_format` of a CSV where detection fails; `axis` is that of matrices of responses
+    (MATLAB, Octave, HDF5) without a frequency vector.
     Returns `LaboratoryFile`. Raises `ValueError`, in one sentence that names the file, for a file
-    that is missing, empty, of another format, damaged, or that states more than it can hold; and
-    where the reader needs a package that is not installed.
+    that is missing, empty, of another format, damaged, or that declares more data than it can hold;
+    and where the reader needs a package that is not installed.
     """
     kind = _kind(path)
     module, function = _READERS[kind]
     read = getattr(importlib.import_module(f"{_ROOM}.{module}"), function)
     options = (text_format,) if kind == "csv" else (axis,) if kind in _OF_ARRAYS else ()
-    held: LaboratoryFile = read(Path(path), *options)
-    if held.is_empty:
-        why = f": {' '.join(map(str, held.notes[:_MOST_REASONS]))}" if held.notes else "."
-        raise ValueError(f"{held.name} holds nothing that could be read{why}")
-    return held._replace(
-        recordings=tuple(map(with_named_channels, held.recordings)),
-        tables=tuple(table.with_named_units() for table in held.tables),
+    contents: LaboratoryFile = read(Path(path), *options)
+    if contents.is_empty:
+        why = f": {' '.join(map(str, contents.notes[:_MOST_REASONS]))}" if contents.notes else "."
+        raise ValueError(f"{contents.name} holds nothing that could be read{why}")
+    return contents._replace(
+        recordings=tuple(map(with_named_channels, contents.recordings)),
+        tables=tuple(table.with_named_units() for table in contents.tables),
     )
 
 
@@ -59,7 +59,7 @@ def _kind(path: FilePath) -> Kind:
     name, head = file_name(path), read_bytes(path, _HEAD)
     if not head:
         raise ValueError(f"{name} is empty.")
-    if any(head[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048)):  # behind a user block
+    if any(head[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048)):  # after a user block
         matlab = head.startswith(b"MATLAB 7.3") or Path(path).suffix.lower() == ".mat"
         return "matlab" if matlab else "hdf5"
     if head.startswith(b"TDSm"):
@@ -73,13 +73,13 @@ def _kind(path: FilePath) -> Kind:
     first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()
     if first == b"    -1":
         return "uff"
-    if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):  # text of 16 bits
-        raise ValueError(f"{name} is of no known format ({_seen(head)}).")
+    if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):  # UTF-16 text
+        raise ValueError(f"{name} is of no known format ({_description(head)}).")
     return "csv"
 
 
-def _seen(head: bytes) -> str:
-    """What a file looks like that is none of ours."""
+def _description(head: bytes) -> str:
+    """Description of a file of unknown format."""
     for start, meaning in (
         (b"PK", "it is a zip archive: unpack it first"),
         (b"\x1f\x8b", "it is a gzip archive: unpack it first"),

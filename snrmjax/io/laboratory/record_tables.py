@@ -25,12 +25,12 @@ _COLUMNS: dict[str, Quantity] = {
 }
 _MOTIONS = ("velocity_m_s", "acceleration_m_s2", "displacement_m")
 _FEWEST = 16  # samples of a record
-_EVEN = 1e-2  # of a step, by which a time may be off; and what its digits leave open
+_EVEN = 1e-2  # of a step: tolerance of an even time
 _MOST_DIGITS = 9
 
 
 def is_record_table(path: FilePath) -> bool:
-    """Whether a CSV's header names `time_s`: a time record, no table of steady states."""
+    """Whether a CSV's header has `time_s`, which makes it a time record."""
     return "time_s" in header_of(path)
 
 
@@ -39,11 +39,11 @@ def read_record_table(path: FilePath) -> TimeRecording:
 
     Columns: `time_s`; `force_n` (N), `drive_v` (V, of the generator), or neither for a free decay;
     of each sensor one motion, `velocity_m_s`, `acceleration_m_s2` or `displacement_m`, alone or
-    behind the sensor's name and a point: `tip.velocity_m_s`. Other columns are left out with a
+    after the sensor's name and a point: `tip.velocity_m_s`. Other columns are left out with a
     note.
     Returns a `TimeRecording` whose channels have the names of the columns and the sensor as their
-    `point`. Raises `ValueError` as `read_cells` does, for times that do not rise evenly, two
-    motions of one sensor and none at all, and for fewer than 16 samples.
+    `point`. Raises `ValueError` as `read_cells` does, for times not evenly increasing, for two
+    motions of one sensor or none at all, and for fewer than 16 samples.
     """
     cells = read_cells(path)
     file = cells.file
@@ -62,10 +62,10 @@ def read_record_table(path: FilePath) -> TimeRecording:
 
 
 def with_named_channels(recording: TimeRecording) -> TimeRecording:
-    """A laboratory's record with the quantities that units in the names of its channels say.
+    """A laboratory record with quantities from the units in its channel names.
 
-    Where a file states no unit, `Force / N`, `tip_mm_s` or `tip.velocity_m_s` do (`label_of`), the
-    last the place, too; a quantity that the file states stays.
+    Used where the file states none: `Force / N`, `tip_mm_s` or `tip.velocity_m_s` (`label_of`),
+    the last with the point. A quantity stated by the file is kept.
     """
     channels = tuple(_named(channel) for channel in recording.channels)
     return dataclasses.replace(recording, channels=channels)
@@ -79,12 +79,12 @@ def _named(channel: Channel) -> Channel:
     if channel.quantity != "unknown" or quantity == "unknown":
         return channel
     ours = (re.fullmatch(rf"(.+)[._]{column}", channel.name) for column in _COLUMNS)
-    place = channel.point or next((match[1] for match in ours if match), "")
-    return channel._replace(quantity=quantity, unit=unit, calibration=calibration, point=place)
+    point = channel.point or next((match[1] for match in ours if match), "")
+    return channel._replace(quantity=quantity, unit=unit, calibration=calibration, point=point)
 
 
 def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
-    """Channels of the columns that are understood, and notes on the others."""
+    """Channels of the known columns, and notes on the others."""
     if "time_s" not in names:
         raise ValueError(f"{file} is no time record: it has no column `time_s`.")
     channels, others = [], []
@@ -97,16 +97,16 @@ def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
             continue
         quantity = _COLUMNS[column]
         channels.append(Channel(name, quantity, column.split("_", 1)[1], 1.0, sensor))
-    places = [channel.point for channel in channels if channel.quantity not in ("force", "voltage")]
-    if not places:
+    points = [channel.point for channel in channels if channel.quantity not in ("force", "voltage")]
+    if not points:
         near = "".join(suggestion(name, _MOTIONS) for name in others[:1])
         raise ValueError(
             f"a time record needs {', '.join(_MOTIONS[:2])} or {_MOTIONS[2]}, but {file} has "
             f"{', '.join(names)}{near}."
         )
-    for place in places:
-        if places.count(place) > 1:
-            whose = f"sensor {place}" if place else "one sensor"
+    for point in points:
+        if points.count(point) > 1:
+            whose = f"sensor {point}" if point else "one sensor"
             raise ValueError(
                 f"{file} has two motions of {whose}: keep one, or name sensors as in "
                 "`tip.velocity_m_s`."
@@ -115,14 +115,14 @@ def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
 
 
 def _sampling_rate(time: Float[np.ndarray, " row"], file: str) -> tuple[float, list[Fact]]:
-    """Samples a second of times that rise evenly, as far as their digits say, and notes."""
+    """The sampling rate (Hz) of times that are even within their printed digits, and notes."""
     steps = np.diff(time)
     step = float(time[-1] - time[0]) / len(steps)
-    away = np.abs(time - time[0] - step * np.arange(len(time)))
+    deviation = np.abs(time - time[0] - step * np.arange(len(time)))
     typical = float(np.median(steps))
-    allowed = max(_EVEN * typical, 1.01 * _rounding(time, typical))
-    worst = int(np.argmax(away))
-    if away[worst] <= allowed and step > 0:
+    allowed = max(_EVEN * typical, 1.01 * _last_digit(time, typical))
+    worst = int(np.argmax(deviation))
+    if deviation[worst] <= allowed and step > 0:
         return 1 / step, []
     if (printed := rate_of_printed_times(time)) is not None:
         return printed.rate, [] if printed.note is None else [printed.note]
@@ -139,8 +139,8 @@ def _sampling_rate(time: Float[np.ndarray, " row"], file: str) -> tuple[float, l
     )
 
 
-def _rounding(time: Float[np.ndarray, " row"], step: float) -> float:
-    """The unit of the last digit that times are written with, where it is well below a step."""
+def _last_digit(time: Float[np.ndarray, " row"], step: float) -> float:
+    """The unit of the last digit of the times, if well below a step; else 0."""
     for digits in range(_MOST_DIGITS + 1):
         unit = 10.0**-digits
         if unit <= 0.2 * step and np.allclose(

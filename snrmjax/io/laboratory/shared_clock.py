@@ -1,4 +1,4 @@
-"""Channels of one test on one clock: shifted by the starts that files state, joined over files."""
+"""Channels of one test on a common clock: aligned by stated start times, joined across files."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -12,12 +12,12 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import AbstractSamples, TimeRecording
 from snrmjax.numerics.facts import Fact
 
-_WHOLE = 1e-2  # of a sample, within which a shift is one of whole samples
-_ALIKE = 1e-12  # relative, of two steps in the properties of one device
+_WHOLE = 1e-2  # of a sample: tolerance of a shift by whole samples
+_ALIKE = 1e-12  # relative tolerance of equal time steps of one device
 
 
 class TimeAxis(NamedTuple):
-    """What a channel's file says of its samples' times."""
+    """Sampling times of a channel, as stated by the file."""
 
     step: float  # s
     start: float  # s, of the first sample
@@ -25,20 +25,20 @@ class TimeAxis(NamedTuple):
 
 
 class SharedAxis(NamedTuple):
-    """Channels that were sampled at the same instants, and where in each the common part begins."""
+    """Channels sampled at the same instants, and where the common part begins in each."""
 
     channels: tuple[str, ...]
     skipped: tuple[int, ...]  # samples of each channel before the common part
     axis: TimeAxis
-    cut: tuple[str, ...] = ()  # channels that go on behind it
+    cut: tuple[str, ...] = ()  # channels that continue after it
 
 
 def shared_axes(stated: Mapping[str, TimeAxis]) -> list[SharedAxis]:
-    """Channels in groups that have their instants in common, in the order of their first ones.
+    """Group channels by common sampling instants, in the order of their first members.
 
-    Channels of one step whose starts differ by whole samples are of one group, of which the time
-    that all have is kept, if that is most of it; others stay apart: a fraction of a sample is an
-    error of the phase.
+    Channels of equal step whose starts differ by whole samples form a group if they overlap for
+    most of the time; the overlap is kept. Others stay separate: a fraction of a sample would be a
+    phase error.
     """
     groups: list[dict[str, TimeAxis]] = []
     for key, axis in stated.items():
@@ -52,15 +52,15 @@ def shared_axes(stated: Mapping[str, TimeAxis]) -> list[SharedAxis]:
         step = next(iter(group.values())).step
         first = max(axis.start for axis in group.values())
         skipped = [round((first - axis.start) / step) for axis in group.values()]
-        left = [axis.n_samples - n for axis, n in zip(group.values(), skipped, strict=True)]
-        axis = TimeAxis(step, first, min(left))
-        cut = tuple(key for key, n in zip(group, left, strict=True) if n > min(left))
+        remaining = [axis.n_samples - n for axis, n in zip(group.values(), skipped, strict=True)]
+        axis = TimeAxis(step, first, min(remaining))
+        cut = tuple(key for key, n in zip(group, remaining, strict=True) if n > min(remaining))
         shared.append(SharedAxis(tuple(group), tuple(skipped), axis, cut))
     return shared
 
 
 def _in_step(axis: TimeAxis, group: Sequence[TimeAxis]) -> bool:
-    """Whether a channel has its instants in common with a group, and most of its time."""
+    """Whether a channel shares sampling instants and most of its time with a group."""
     one = group[0]
     shift = (axis.start - one.start) / one.step
     together = [*group, axis]
@@ -79,7 +79,7 @@ def note_on_shift(shared: SharedAxis) -> tuple[Fact, ...]:
     cut = (Fact("channels_cut", names=shared.cut, n=shared.axis.n_samples),) if shared.cut else ()
     if not any(shared.skipped):
         return cut
-    # The last to begin skips nothing: the others are told by how much earlier they began.
+    # The last to begin skips nothing; the note lists how much earlier the others began.
     shifts = dict(zip(shared.channels, shared.skipped, strict=True))
     earlier = {name: n for name, n in shifts.items() if n}
     shifted = Fact(
@@ -91,7 +91,7 @@ def note_on_shift(shared: SharedAxis) -> tuple[Fact, ...]:
 
 
 class _JoinedSamples(AbstractSamples):
-    """The channels of records of one channel each, all of one length."""
+    """Samples of single-channel records of equal length."""
 
     def __init__(self, records: Sequence[TimeRecording]) -> None:
         self._records = [record.samples for record in records]
@@ -104,15 +104,15 @@ class _JoinedSamples(AbstractSamples):
     def read(
         self, channels: Sequence[int], start: int, stop: int
     ) -> Num[np.ndarray, "channel sample"]:
-        """A stretch of some channels."""
+        """Samples of some channels."""
         return np.concatenate([self._records[k].read([0], start, stop) for k in channels])
 
 
 def joined_structs(records: Sequence[TimeRecording]) -> list[TimeRecording]:
-    """Records of one channel each, of one clock, as one: those of structs called force and so on.
+    """Join single-channel records on a common clock, such as structs named force and response.
 
-    One of them at least must be called what drives a structure: structs called "run1" and "run2"
-    are two tests. Channels of one name get their struct's.
+    At least one name must be an excitation: structs named "run1" and "run2" are two tests. Channels
+    with equal names take the name of their struct.
     """
     named = [one.name.rsplit(".", 1)[-1] for one in records]
     single = len(records) > 1 and all(len(one.channels) == 1 for one in records)
@@ -136,14 +136,14 @@ def joined_structs(records: Sequence[TimeRecording]) -> list[TimeRecording]:
 def joined_by_clock(
     records: Mapping[str, Sequence[TimeRecording]],
 ) -> tuple[TimeRecording, str] | None:
-    """One record of the channels of several files, or None where they are none of one clock.
+    """Join the channels of several files into one record; None where they have no common clock.
 
-    A test is in several files where each of them holds one record of a single channel, all of one
-    rate, start and length, and no two of one name and quantity: those would be two tests. Channels
-    keep their names; those of one name get their file's.
+    Each file must have one record of a single channel, all of equal rate, start and length, and no
+    two of equal name and quantity (those would be two tests). Channels with equal names take the
+    name of their file.
     Arguments: `records` of each file by its name.
     """
-    single = {file: held[0] for file, held in records.items() if len(held) == 1}
+    single = {file: recordings[0] for file, recordings in records.items() if len(recordings) == 1}
     if len(single) < 2 or len(single) < len(records):
         return None
     each = list(single.values())

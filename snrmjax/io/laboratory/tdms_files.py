@@ -1,4 +1,4 @@
-"""TDMS files (LabVIEW, NI): groups of channels with properties, read piece by piece."""
+"""TDMS files (LabVIEW, NI): groups of channels with properties, read on demand."""
 
 import weakref
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Num
 
 from snrmjax.io.laboratory.arrays.structs import read_struct
-from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
+from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, in_memory
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.physical_units import channel_meaning
@@ -28,7 +28,7 @@ _MOST_CHANNELS = 4096
 
 
 class _TdmsSamples(AbstractSamples):
-    """Channels of one group. The file is open until this is forgotten."""
+    """Samples of the channels of one group; keeps the file open for its lifetime."""
 
     def __init__(
         self, file: Any, channels: Sequence[Any], skipped: Sequence[int], n_samples: int, name: str
@@ -45,14 +45,14 @@ class _TdmsSamples(AbstractSamples):
     def read(
         self, channels: Sequence[int], start: int, stop: int
     ) -> Num[np.ndarray, "channel sample"]:
-        """A stretch of some channels."""
+        """Samples of some channels."""
         rows = []
         for k in channels:
             with damaged_if_it_fails(self._name, "a TDMS file"):
                 first = start + self._skipped[k]
                 rows.append(self._channels[k].read_data(first, max(0, stop - start)))
         if any(len(row) != stop - start for row in rows):
-            raise ValueError(f"{self._name} is damaged: samples {start} to {stop} are not there.")
+            raise ValueError(f"{self._name} is damaged: samples {start} to {stop} are missing.")
         return np.stack(rows)
 
 
@@ -73,33 +73,33 @@ def read_tdms(path: Path) -> LaboratoryFile:
         ]
     _check_sizes(counted, size, path.name)
     for name, channels in groups:
-        waves: dict[str, TimeAxis] = {}
-        began = _began(channels)
-        loose: dict[str, Node] = {}
+        waveforms: dict[str, TimeAxis] = {}
+        start_times = _start_times(channels)
+        separate: dict[str, Node] = {}
         for channel in channels:
             if not len(channel) or channel.dtype.kind not in "biufc":
                 notes.append(
-                    Fact("not_read", name=f"channel {channel.name}", why=_why_not(channel))
+                    Fact("not_read", name=f"channel {channel.name}", why=_reason_unread(channel))
                 )
                 continue
             step = _number(channel, "wf_increment")
             start = _number(channel, "wf_start_offset") or 0.0
             if step is not None and step > 0 and len(channel) > 1 and _is_spectrum(channel):
                 lines = start + step * np.arange(len(channel))
-                alike = loose.get("frequency")
+                alike = separate.get("frequency")
                 other = isinstance(alike, Numbers) and alike.length != len(lines)
                 axis = f"frequency of {channel.name}" if other else "frequency"
-                loose.setdefault(axis, held(lines, {"unit": "Hz"}))
-                loose[channel.name] = _numbers(path, name, channel)
+                separate.setdefault(axis, in_memory(lines, {"unit": "Hz"}))
+                separate[channel.name] = _numbers(path, name, channel)
             elif step is not None and step > 0 and len(channel) > 1 and channel.dtype.kind != "c":
-                start += began.get(channel.name, 0.0)
-                waves[channel.name] = TimeAxis(step, start, len(channel))
+                start += start_times.get(channel.name, 0.0)
+                waveforms[channel.name] = TimeAxis(step, start, len(channel))
             else:
-                loose[channel.name] = _numbers(path, name, channel)
-        for shared in shared_axes(waves):
+                separate[channel.name] = _numbers(path, name, channel)
+        for shared in shared_axes(waveforms):
             recordings.append(_recording(path, name, channels, shared))
             notes += note_on_shift(shared)
-        contents = read_struct(name, loose)
+        contents = read_struct(name, separate)
         recordings.extend(contents.recordings)
         tables.extend(table._replace(name=name) for table in contents.numbered())
         notes.extend(contents.notes)
@@ -111,13 +111,13 @@ def read_tdms(path: Path) -> LaboratoryFile:
 def _contents(file: BinaryIO) -> Any:
     """Groups and channels of an open file.
 
-    The library would believe an index of another measurement that lies beside a file of its path.
+    Opening by path would use an index file next to it, possibly of another measurement.
     """
     return library("nptdms", "reading TDMS").TdmsFile.open(file)
 
 
 def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str) -> None:
-    """Refuse more samples than the file has bytes for, and more channels than a test has."""
+    """Refuse more samples than the file can hold, and too many channels."""
     if len(counted) > _MOST_CHANNELS:
         raise ValueError(f"{file} has {len(counted)} channels, more than {_MOST_CHANNELS}.")
     total = sum(
@@ -129,8 +129,8 @@ def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str)
         raise ValueError(f"{file} states {total} bytes of samples, but has {size} bytes.")
 
 
-def _began(channels: Sequence[Any]) -> dict[str, float]:
-    """Seconds by which channels began after the first of them, by the times that they state."""
+def _start_times(channels: Sequence[Any]) -> dict[str, float]:
+    """Start times of channels in s after the first of them, as stated in the file."""
     stated = {
         channel.name: value.astype("datetime64[us]")
         for channel in channels
@@ -144,13 +144,13 @@ def _began(channels: Sequence[Any]) -> dict[str, float]:
 
 
 def _recording(path: Path, name: str, channels: Sequence[Any], shared: SharedAxis) -> TimeRecording:
-    """Channels of one clock as a time record."""
+    """Channels on a common clock as a time record."""
     channels = [next(one for one in channels if one.name == key) for key in shared.channels]
-    with ExitStack() as kept, damaged_if_it_fails(path.name, "a TDMS file"):
-        file = kept.enter_context(open(path, "rb"))
+    with ExitStack() as stack, damaged_if_it_fails(path.name, "a TDMS file"):
+        file = stack.enter_context(open(path, "rb"))
         group = _contents(file)[name]
         opened = [group[channel.name] for channel in channels]
-        kept.pop_all()  # it stays open until the samples are forgotten
+        stack.pop_all()  # the file stays open as long as the samples exist
     axis = shared.axis
     samples = _TdmsSamples(file, opened, shared.skipped, axis.n_samples, path.name)
     listed = []
@@ -165,7 +165,7 @@ def _recording(path: Path, name: str, channels: Sequence[Any], shared: SharedAxi
 
 
 def _numbers(path: Path, group: str, channel: Any) -> Numbers:
-    """A channel without a rate as numbers that are read when asked."""
+    """A channel without a rate as numbers that are read on demand."""
     name, unit = channel.name, _unit(channel)
 
     def read(at: Selection) -> np.ndarray:
@@ -177,21 +177,21 @@ def _numbers(path: Path, group: str, channel: Any) -> Numbers:
 
 
 def _is_spectrum(channel: Any) -> bool:
-    """Whether the even abscissa of a channel is a frequency: its steps are no sampling interval."""
+    """Whether the even abscissa of a channel is a frequency and not a time."""
     unit = str(channel.properties.get("wf_xunit_string", "")).strip().lower()
     name = str(channel.properties.get("wf_xname", "")).strip().lower()
     return unit in ("hz", "hertz") or (not unit and name in ("frequency", "frequenz"))
 
 
-def _why_not(channel: Any) -> str:
-    """What a channel holds that is not read."""
+def _reason_unread(channel: Any) -> str:
+    """Why a channel is not read."""
     if not len(channel):
         return "empty"
     return "times_of_day" if channel.dtype.kind in "MV" else "type"
 
 
 def _unit(channel: Any) -> str:
-    """The unit that a property states."""
+    """The unit stated by a property."""
     for key in _UNITS:
         value = channel.properties.get(key)
         if isinstance(value, str) and value.strip():

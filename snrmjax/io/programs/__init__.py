@@ -1,1 +1,1 @@
-"""Programs on disk: compiled ones that are kept, and Python files with a user's own effects."""
+"""Programs on disk: cached compiled programs, and Python files with user-defined effects."""

@@ -1,4 +1,4 @@
-"""A user's own effects from Python files, as commands and the processes of a study load them."""
+"""User-defined effects from Python files, for commands and the processes of a study."""
 
 import hashlib
 import importlib.util
@@ -12,14 +12,14 @@ from snrmjax.io.files import read_text
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effects import known_effects, register_effect
 
-_loaded: dict[Path, str] = {}  # in the order in which they were loaded: file and what it was
+_loaded: dict[Path, str] = {}  # file and digest, in loading order
 
 
 def load_effects(path: str | os.PathLike[str]) -> None:
     """Run a Python file and register the effects that it defines, as `register_effect` does.
 
-    Those that the file registers itself are taken too. What stands beside the file can be imported
-    in it. A file that is loaded already is not run again.
+    The file may also register effects itself and import modules from its folder. A file that is
+    already loaded is not run again.
     Raises `ValueError` for a file that cannot be read or run, for one that defines no effect, and
     for an effect whose kind exists already or that has no parameter.
     """
@@ -44,12 +44,12 @@ def load_effects(path: str | os.PathLike[str]) -> None:
 
 
 def loaded_effects() -> dict[Path, str]:
-    """The files whose effects are loaded, with the digest of what they held, in their order."""
+    """The loaded files with the digests of their contents, in loading order."""
     return dict(_loaded)
 
 
 def _run(file: Path) -> ModuleType:
-    # A name that is the same in every process, and that no other module has: pickles go by it.
+    # A unique name that is the same in every process, since pickles refer to it.
     name = f"own_effects_{hashlib.sha256(os.fsencode(file)).hexdigest()[:16]}"
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
@@ -59,17 +59,17 @@ def _run(file: Path) -> ModuleType:
         sys.path.append(str(file.parent))
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:  # whatever a user's file does
+    except (Exception, SystemExit) as error:  # a user's file may raise anything
         del sys.modules[name]
-        said = (str(error).splitlines() or [""])[0].rstrip(".")
+        message = (str(error).splitlines() or [""])[0].rstrip(".")
         raise ValueError(
-            f"{file.name} cannot be loaded: {type(error).__name__}{said and f': {said}'}."
+            f"{file.name} cannot be loaded: {type(error).__name__}{message and f': {message}'}."
         ) from error
     return module
 
 
 def _defined(module: ModuleType) -> list[type[AbstractEffect]]:
-    """The effects whose classes stand in a file itself, in their order."""
+    """The effects whose classes are defined in the file, in order."""
     return [
         value
         for value in vars(module).values()

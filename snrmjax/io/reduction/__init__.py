@@ -1,1 +1,1 @@
-"""What reduced models are condensed from: beams as TOML, and folders of load-case tables."""
+"""Sources of reduced models: beams as TOML, and folders of load-case tables."""

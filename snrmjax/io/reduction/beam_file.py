@@ -13,7 +13,7 @@ length_m = 0.2286
 radius_m = 11.43                     # or rise_m, height over the chord; neither: straight
 elements = 40
 [supports]
-left = "clamped"                     # "clamped", "pinned", "free" or stiffnesses (inf: held)
+left = "clamped"                     # "clamped", "pinned", "free" or stiffnesses (inf: fixed)
 right = { axial_n_m = 1e6, transverse_n_m = inf, rotation_nm_rad = 50.0 }
 [condense]
 modes = [1, 3, 5]
@@ -34,7 +34,7 @@ import numpy as np
 
 from snrmjax.condense.beam_description import (
     LENGTH,
-    MOST_RISE,
+    MAX_RISE,
     POISSON,
     RADIUS,
     RISE,
@@ -42,7 +42,7 @@ from snrmjax.condense.beam_description import (
     STIFFNESSES,
     THICKNESS,
     BeamDescription,
-    what_is_loose,
+    unconstrained_motion,
 )
 from snrmjax.condense.beam_models import BeamModels
 from snrmjax.condense.beam_source import beam_source
@@ -58,10 +58,10 @@ _POINT_MASS = "point_mass"
 
 
 def read_beam_description(path: FilePath) -> BeamDescription:
-    """Read a beam from a TOML; its format is told at the top of this module.
+    """Read a beam from a TOML in the format at the top of this module.
 
-    Raises `ValueError` that names file, table, key, value and what was expected; a near miss is
-    suggested for an unknown key.
+    Raises `ValueError` that names file, table, key, value and expectation, with a suggestion for a
+    misspelt key.
     """
     file = file_name(path)
     top = parsed_toml(read_text(path), file)
@@ -84,10 +84,10 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     numbers |= _geometry(geometry, section)
     for side in SIDES:
         springs = zip(STIFFNESSES, _support(supports, side), strict=True)
-        numbers |= {f"supports.{side}.{key}": size for key, size in springs}
-    missing = what_is_loose(numbers)  # a mechanism has no static load cases
+        numbers |= {f"supports.{side}.{key}": stiffness for key, stiffness in springs}
+    missing = unconstrained_motion(numbers)  # a mechanism has no static load cases
     if missing is not None:
-        raise ValueError(f"{supports.place} leave a mechanism: {missing}.")
+        raise ValueError(f"{supports.location} leave a mechanism: {missing}.")
     masses_at = []
     for k, mass in enumerate(top.tables(_POINT_MASS, file), 1):
         mass.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
@@ -102,13 +102,13 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     if len(modes) > 8:
         raise of_modes.refusal("modes", "at most 8 modes", list(modes))
     if max(modes) > elements:
-        expected = f"mode numbers that {elements} elements can show (at most {elements})"
+        expected = f"mode numbers that {elements} elements can represent (at most {elements})"
         raise of_modes.refusal("modes", expected, max(modes))
     degree = of_modes.whole("degree", 2, 3)
     if degree > 7:
         raise of_modes.refusal("degree", "from 2 to 7", degree)
     scaled = "load_scale" in of_modes.entries
-    places = tuple((name, sensors.number(name, FRACTION)) for name in sensors.entries)
+    positions = tuple((name, sensors.number(name, FRACTION)) for name in sensors.entries)
     damping = of_modes.numbers_of_modes("damping_ratio", len(modes), BELOW_ONE)
     return BeamDescription(
         name=top.text("name", file.removesuffix(".toml")),
@@ -118,7 +118,7 @@ def read_beam_description(path: FilePath) -> BeamDescription:
         load_scale=of_modes.number("load_scale", POSITIVE) if scaled else None,
         degree=degree,
         damping_ratio=None if damping is None else tuple(damping),
-        sensors=places or (("midspan", 0.5),),
+        sensors=positions or (("midspan", 0.5),),
         force_at=_force(force),
         masses_at=tuple(masses_at),
     )
@@ -127,9 +127,9 @@ def read_beam_description(path: FilePath) -> BeamDescription:
 def read_beam(path: FilePath) -> ReductionSource:
     """Read a beam and prepare its finite elements, modes and load cases.
 
-    Forces act across the beam; one newton of a uniform force is spread over its whole length.
+    Forces are transverse; a uniform force is one newton distributed over the length.
     Raises `ValueError` as `read_beam_description` does, and where the elements have no such modes
-    or a sensor or force is at a place that none of them moves.
+    or a sensor or force is at a node of all of them.
     """
     return beam_source(read_beam_description(path), file_name(path))
 
@@ -138,10 +138,10 @@ def read_beam_models(path: FilePath) -> BeamModels:
     """Read a beam file as a function from its numbers to reduced models.
 
     Typical use: `models = sj.io.read_beam_models("beam.toml")`, then
-    `models({"section.thickness_m": 0.6e-3})`, alone, within `jax.grad`, in a study, or in
+    `models({"section.thickness_m": 0.6e-3})`, directly, within `jax.grad`, in a study, or in
     `sj.identify.calibrate_to_backbone`.
     Returns the models. Raises `ValueError` as `read_beam` does, and where no load scale is stated
-    and none is found for the beam of the file.
+    and none can be determined for the beam.
     """
     stated, file = read_beam_description(path), file_name(path)
     source = beam_source(stated, file)
@@ -151,7 +151,7 @@ def read_beam_models(path: FilePath) -> BeamModels:
 
 
 def is_beam_file(path: FilePath) -> bool:
-    """Whether a TOML describes a beam (and not a model): whether it has a table of one.
+    """Whether a TOML describes a beam and not a model, by its tables.
 
     Raises `ValueError` where it cannot be read.
     """
@@ -160,7 +160,7 @@ def is_beam_file(path: FilePath) -> bool:
 
 
 def _geometry(geometry: TomlTable, section: TomlTable) -> dict[str, float]:
-    """Length, thickness and the curvature that is stated."""
+    """Length, thickness and the stated curvature."""
     length = geometry.number("length_m", POSITIVE)
     thickness = section.number("thickness_m", POSITIVE)
     if not thickness < length:
@@ -172,25 +172,25 @@ def _geometry(geometry: TomlTable, section: TomlTable) -> dict[str, float]:
     if "radius_m" not in geometry.entries:
         return {**known, RISE: rise}
     if "rise_m" in geometry.entries:
-        raise ValueError(f"{geometry.place} has both `radius_m` and `rise_m`: one is enough.")
+        raise ValueError(f"{geometry.location} has both `radius_m` and `rise_m`: one is enough.")
     radius = geometry.number("radius_m", POSITIVE)
-    if not length < 2 * MOST_RISE * radius:
-        raise geometry.refusal("radius_m", f"above {length / (2 * MOST_RISE):.4g}", radius)
+    if not length < 2 * MAX_RISE * radius:
+        raise geometry.refusal("radius_m", f"above {length / (2 * MAX_RISE):.4g}", radius)
     return {**known, RADIUS: radius}
 
 
 def _support(table: TomlTable, side: str) -> tuple[float, ...]:
-    """Stiffnesses along the chord, across it and in rotation; infinite is held, zero free."""
+    """Stiffnesses along the chord, across it and in rotation; infinite is fixed, zero free."""
     value = table.entries[side]
     if isinstance(value, dict):
-        springs = TomlTable(value, f"{side} of {table.place}")
+        springs = TomlTable(value, f"{side} of {table.location}")
         springs.check_keys((), STIFFNESSES)
         if not value:
             raise table.refusal(side, f"a support or stiffnesses ({', '.join(STIFFNESSES)})", value)
         return tuple(_stiffness(springs, key) for key in STIFFNESSES)
     kind = table.choice(side, SUPPORTS)
-    held = np.inf if kind != "free" else 0.0
-    return held, held, np.inf if kind == "clamped" else 0.0
+    translational = np.inf if kind != "free" else 0.0
+    return translational, translational, np.inf if kind == "clamped" else 0.0
 
 
 def _stiffness(springs: TomlTable, key: str) -> float:
@@ -202,7 +202,9 @@ def _stiffness(springs: TomlTable, key: str) -> float:
 def _force(table: TomlTable) -> float | None:
     table.check_keys((), ("distribution", "at"))
     if "distribution" in table.entries and "at" in table.entries:
-        raise ValueError(f"{table.place} has both `distribution` and `at`: one of them is enough.")
+        raise ValueError(
+            f"{table.location} has both `distribution` and `at`: one of them is enough."
+        )
     if "at" in table.entries:
         return table.number("at", FRACTION)
     table.choice("distribution", ("uniform",), "uniform")

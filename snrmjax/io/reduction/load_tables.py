@@ -1,4 +1,4 @@
-"""Load cases that another code has run, as a folder of tables.
+"""Load cases from another code, as a folder of tables.
 
 The folder has `modes.toml` and `cases.csv`. `modes.toml`:
 
@@ -6,7 +6,7 @@ The folder has `modes.toml` and `cases.csv`. `modes.toml`:
     frequency_hz = [79.02, 427.46]        # of the modes kept
     numbers = [1, 3]                      # optional: their numbers in the finite-element model
     damping_ratio = [0.01, 0.01]          # optional, one number or one a mode; 0.01 is assumed
-    shapes = "shapes.csv"                 # mass-normalised: `shape_1, shape_2`, a row a freedom
+    shapes = "shapes.csv"                 # mass-normalised: `shape_1, shape_2`, a row a dof
     mass = "mass.csv"                     # optional: `mass_1 … mass_n`, or one column `mass`
     participation = [247.8, 108.5]        # optional: a point force at the first sensor
     [sensors]                             # optional with shapes: where mode 1 is largest
@@ -14,7 +14,7 @@ The folder has `modes.toml` and `cases.csv`. `modes.toml`:
 
 `cases.csv` has a row a case and the columns `case` (a name), the modal forces `f_1 …` of
 F = M Φ f, and modal displacements `q_1 …` or nodal ones `u_1 …` in the order of the rows of the
-shapes; optionally `energy` (J), which is a free check. Empty displacements mark a case without
+shapes; optionally `energy` (J), as a check. Empty displacements mark a case without
 solution. All numbers are SI.
 
 A code that writes only nodal displacements needs `case, f_1 …, u_1 …` and the shapes at the same
@@ -23,15 +23,15 @@ degrees of freedom, such as
     case,f_1,u_1,u_2,u_3                  (cases.csv)
     up,12.5,1.14e-4,2.31e-4,1.14e-4
     down,-12.5,-1.14e-4,-2.31e-4,-1.14e-4
-    shape_1                               (shapes.csv: at the freedoms u_1, u_2, u_3)
+    shape_1                               (shapes.csv: at u_1, u_2, u_3)
     5.95
     12.04
     5.95
 
 Modal coordinates are q = ΦᵀM u where a mass matrix is given, else the least-squares fit q = Φ⁺u at
-the freedoms that were written. That is exact where what the load cases add to the modes is
+the written degrees of freedom. That is exact where the displacement outside the modal space is
 orthogonal to the shapes there, as the stretching of a flat structure is; else state a mass matrix,
-or write `q_1 …`. From arrays in Python, `snrmjax.condense.reduced_model` starts at once.
+or write `q_1 …`. For arrays in Python use `snrmjax.condense.reduced_model`.
 """
 
 import os
@@ -55,34 +55,37 @@ from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, POSITIVE
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
 _NUMBERED = re.compile(r"([a-z]+)_([1-9][0-9]{0,5})")
-_ORTHOGONAL = 1e-3  # of ΦᵀMΦ − I: files have few digits
+_ORTHOGONAL = 1e-3  # tolerance of ΦᵀMΦ − I: files have few digits
 
 
 class _Matrix(NamedTuple):
-    """A matrix of the folder, and the file it is from."""
+    """A matrix and its file name."""
 
     values: np.ndarray
     file: str
 
 
 def read_load_tables(folder: FilePath) -> ReductionSource:
-    """Read a folder of load-case tables; its format is told at the top of this module.
+    """Read a folder of load-case tables in the format at the top of this module.
 
-    Returns modes and cases. Raises `ValueError` that names file, row, column and what was
-    expected; shapes that are not mass-normalised, load vectors that the modes cannot balance and
-    tables that do not fit together are refused too.
+    Returns modes and cases. Raises `ValueError` that names file, row, column and expectation, also
+    for shapes that are not mass-normalised, load vectors that the modes cannot balance and
+    inconsistent tables.
     """
-    place = Path(folder)
-    if not place.is_dir():
-        what = "is a file, but a folder is expected" if place.exists() else "does not exist"
+    folder_path = Path(folder)
+    if not folder_path.is_dir():
+        what = "is a file, but a folder is expected" if folder_path.exists() else "does not exist"
         raise ValueError(f"{os.fspath(folder)} {what}.")
-    top = parsed_toml(read_text(place / "modes.toml"), "modes.toml")
+    top = parsed_toml(read_text(folder_path / "modes.toml"), "modes.toml")
     top.check_keys(("frequency_hz",), _KEYS)
     frequency = np.array(top.numbers("frequency_hz", POSITIVE, IN_RANGE_HZ, each="mode")) * HERTZ
     n = frequency.size
     if not n:
         raise ValueError("`frequency_hz` of modes.toml must have at least one mode, but is empty.")
-    shapes, mass = _matrix(top, place, "shapes", "shape"), _matrix(top, place, "mass", "mass")
+    shapes, mass = (
+        _matrix(top, folder_path, "shapes", "shape"),
+        _matrix(top, folder_path, "mass", "mass"),
+    )
     if mass is not None and shapes is None:
         raise ValueError("modes.toml has a `mass`, but no `shapes`.")
     if shapes is not None and shapes.values.shape[1] != n:
@@ -103,12 +106,12 @@ def read_load_tables(folder: FilePath) -> ReductionSource:
     if damping is None:
         notes.append(Fact("damping_assumed", ratio=ASSUMED_DAMPING))
     return ReductionSource(
-        name=top.text("name", place.resolve().name),
+        name=top.text("name", folder_path.resolve().name),
         basis=basis,
         damping_ratio=np.array(damping or [ASSUMED_DAMPING] * n),
         sensors=sensors,
         participation=np.array(participation or first),
-        cases=_read_cases(place / "cases.csv", basis, shapes),
+        cases=_read_cases(folder_path / "cases.csv", basis, shapes),
         notes=tuple(notes),
     )
 
@@ -141,9 +144,9 @@ def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> St
         empty = np.isnan(displacement).any(axis=1, keepdims=True)
         displacement = np.where(empty, np.nan, displacement)
     if "q" in table.groups:
-        moved = table.group("q", empty_allowed=True)
+        modal_displacement = table.group("q", empty_allowed=True)
     else:
-        moved = np.asarray(displacement) @ np.asarray(basis.filter).T
+        modal_displacement = np.asarray(displacement) @ np.asarray(basis.filter).T
     energy = (
         table.cells.numbers("energy", empty_allowed=True) if table.cells.has("energy") else None
     )
@@ -151,20 +154,20 @@ def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> St
         energy = None
     return StaticCases(
         jnp.asarray(table.group("f")),
-        jnp.asarray(moved),
-        jnp.asarray(np.all(np.isfinite(moved), axis=1)),
+        jnp.asarray(modal_displacement),
+        jnp.asarray(np.all(np.isfinite(modal_displacement), axis=1)),
         None if energy is None else jnp.asarray(energy),
         None if displacement is None else jnp.asarray(displacement),
         names,
     )
 
 
-def _matrix(top: TomlTable, place: Path, key: str, stem: str) -> _Matrix | None:
-    """The table that a key names; None where it is not stated. A mass may be one column."""
+def _matrix(top: TomlTable, folder_path: Path, key: str, stem: str) -> _Matrix | None:
+    """The table named by a key; None where not stated. A mass may be one column."""
     if key not in top.entries:
         return None
     file = top.text(key)
-    table = _read_table(place / file, (stem,), ("dof", *(("mass",) * (key == "mass"))))
+    table = _read_table(folder_path / file, (stem,), ("dof", *(("mass",) * (key == "mass"))))
     if key == "mass" and table.cells.has("mass"):
         return _Matrix(table.cells.numbers("mass"), file)
     if stem not in table.groups:
@@ -179,8 +182,8 @@ def _basis(
     mass: _Matrix | None,
 ) -> ReductionBasis:
     n = frequency.size
-    if given is None:  # modal displacements need none
-        return _of(frequency, np.eye(n), np.eye(n), numbers)
+    if given is None:  # not needed for modal displacements
+        return _reduction_basis(frequency, np.eye(n), np.eye(n), numbers)
     shapes, file = given
     n_dof = len(shapes)
     if n_dof < n:
@@ -193,23 +196,23 @@ def _basis(
         diagonal = mass.values.ndim == 1
         product = mass.values[:, None] * shapes if diagonal else mass.values @ shapes
         _check_identity(shapes.T @ product, numbers, f"{file} and {mass.file}")
-        return _of(frequency, shapes, product.T, numbers)
+        return _reduction_basis(frequency, shapes, product.T, numbers)
     values = np.linalg.svd(shapes / np.linalg.norm(shapes, axis=0), compute_uv=False)
     if not values[-1] > 1e-6 * values[0]:
         raise ValueError(f"the shapes of {file} are not linearly independent.")
-    return _of(frequency, shapes, np.linalg.pinv(shapes), numbers)
+    return _reduction_basis(frequency, shapes, np.linalg.pinv(shapes), numbers)
 
 
-def _of(
+def _reduction_basis(
     frequency: np.ndarray, shapes: np.ndarray, modal: np.ndarray, numbers: tuple[int, ...]
 ) -> ReductionBasis:
     return ReductionBasis(jnp.asarray(frequency), jnp.asarray(shapes), jnp.asarray(modal), numbers)
 
 
 def _check_identity(product: np.ndarray, numbers: tuple[int, ...], files: str) -> None:
-    off = np.abs(product - np.eye(len(product)))
-    row, column = sorted(int(k) for k in np.unravel_index(np.argmax(off), off.shape))
-    if off[row, column] <= _ORTHOGONAL:
+    error = np.abs(product - np.eye(len(product)))
+    row, column = sorted(int(k) for k in np.unravel_index(np.argmax(error), error.shape))
+    if error[row, column] <= _ORTHOGONAL:
         return
     what = "not mass-normalised" if row == column else "not orthogonal"
     which = (
@@ -250,7 +253,7 @@ class _Table(NamedTuple):
 
 
 def _read_table(path: FilePath, stems: tuple[str, ...], single: tuple[str, ...] = ()) -> _Table:
-    """Read a CSV whose columns are `stem_1 … stem_n` for some stems, and some single ones.
+    """Read a CSV with columns `stem_1 … stem_n` for some stems, and some single ones.
 
     Raises `ValueError` that names file, row or column for an unknown or missing column of a group,
     and as `read_cells` does.
@@ -281,15 +284,15 @@ def write_load_cases(path: FilePath, cases: StaticCases) -> None:
     """
     n_cases, n_modes = cases.force.shape
     force = np.asarray(cases.force)
-    moved = np.where(cases.usable[:, None], cases.modal_displacement, np.nan)
+    modal_displacement = np.where(cases.usable[:, None], cases.modal_displacement, np.nan)
     columns = {"case": list(cases.names) or [str(k + 1) for k in range(n_cases)]}
     columns |= {f"f_{m + 1}": _texts(force[:, m]) for m in range(n_modes)}
-    columns |= {f"q_{m + 1}": _texts(moved[:, m]) for m in range(n_modes)}
+    columns |= {f"q_{m + 1}": _texts(modal_displacement[:, m]) for m in range(n_modes)}
     if cases.energy is not None:
         columns["energy"] = _texts(np.where(cases.usable, cases.energy, np.nan))
     write_table(path, columns)
 
 
 def _texts(values: np.ndarray) -> list[str]:
-    """Numbers in full, since small differences of them count; an empty field for NaN."""
+    """Numbers in full precision, since small differences matter; an empty field for NaN."""
     return ["" if np.isnan(value) else repr(value) for value in values.tolist()]

@@ -1,1 +1,1 @@
-"""Free decays with company: one mode of a ring-down apart from others, hum, offset and noise."""
+"""Free decays: one mode separated from interfering modes, hum, offset and noise."""

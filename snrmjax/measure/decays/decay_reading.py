@@ -1,4 +1,4 @@
-"""A decay read by the filter that moves with its mode, and the smooth decay through that."""
+"""A decay read by a mode-tracking filter, and the smooth decay fitted to it."""
 
 from typing import NamedTuple
 
@@ -19,25 +19,25 @@ from snrmjax.measure.decays.mode_ridge import FRAME_CYCLES, Ridge
 from snrmjax.measure.decays.slow_flow import SlowFlow, slow_flow
 from snrmjax.numerics.units import HERTZ
 
-PER_CYCLE = 2  # instants
-POINTS = 4  # cycles from one reading to the next
-_SIGMA = (1.0, 3.0)  # cycles of the filter's weights
-_CYCLES_A_SIGMA = 8 / 3  # of a fall to a quarter, in which one line would be drawn
-_BAND = 0.25  # of the mode's frequency: what the filter passes, one side
-_BESIDE = 0.6  # of it, one side, from where the density inside is taken
+PER_CYCLE = 2  # readings per cycle
+POINTS = 4  # cycles between nearly independent readings
+_SIGMA = (1.0, 3.0)  # smallest and largest σ of the filter's weights, cycles
+_CYCLES_A_SIGMA = 8 / 3  # of a decay to a quarter, per σ of the filter
+_BAND = 0.25  # of the mode's frequency: half width of the filter's passband
+_NEIGHBOURHOOD = 0.6  # of it: half width of the range for the noise density
 _MEDIAN_OF_POWER = float(np.log(2))  # over the mean, of a spectrum's bins
-_SMOOTH_ERROR = 0.005  # of the mode, that the smooth decay may be off without noise
+_SMOOTH_ERROR = 0.005  # relative error of the smooth decay without noise
 
 
 class DecayReading(NamedTuple):
     """A carrier read at half cycles, and the smooth decay through it."""
 
     start: Carrier
-    before: Carrier  # of the last round but one
+    before: Carrier  # before the last round
     carrier: Carrier
     rate: Complex[np.ndarray, " k"]
     smooth: SlowFlow
-    noise: Float[np.ndarray, " k"]  # 1σ of ln A that the residual's spectrum makes
+    noise: Float[np.ndarray, " k"]  # 1σ of ln A from the residual's spectrum
     sigma: float
 
 
@@ -47,9 +47,9 @@ def reading_of(
     ridge: Ridge,
     frequency: float,
 ) -> DecayReading:
-    """Read the mode from its ridge on, then from the smooth decay on, which is right to the ends.
+    """Read the mode starting from its ridge, then from the smooth decay, accurate up to the ends.
 
-    `frequency` (rad/s) is that of which the ridge's frames hold eight cycles.
+    A frame of the ridge has eight cycles of `frequency` (rad/s).
     """
     start, sigma = _extended(ridge, time, frequency), _width(ridge)
     at = instants(start, PER_CYCLE)
@@ -58,7 +58,7 @@ def reading_of(
 
 
 def _extended(ridge: Ridge, time: np.ndarray, frequency: float) -> Carrier:
-    """A carrier of the ridge, and on to the ends of the record where these are a frame away."""
+    """A carrier from the ridge, extrapolated to the ends of the record if within a frame."""
     at = ridge.time
     reach = FRAME_CYCLES * HERTZ / frequency
     begin = time[0] if at[0] - time[0] < reach else at[0]
@@ -81,7 +81,7 @@ def _extended(ridge: Ridge, time: np.ndarray, frequency: float) -> Carrier:
 
 
 def _width(ridge: Ridge) -> float:
-    """σ of the weights in cycles: 3, or less where the motion falls to a quarter in few cycles."""
+    """σ of the weights in cycles: 3, or less if the motion decays to a quarter in few cycles."""
     cycles = float(np.sum(np.diff(ridge.time) * ridge.frequency[1:])) / HERTZ
     fall = float(np.log(ridge.amplitude[0] / ridge.amplitude[-1]))
     quarter = QUARTER * cycles / fall if fall > 0 else np.inf
@@ -99,13 +99,13 @@ def _read_from(
     backwards = np.flatnonzero(rate.imag <= 0)
     if backwards.size:
         raise ValueError(
-            f"the mode cannot be isolated: at {at[backwards[0]]:.4g} s the phase of its motion "
-            "runs backwards, as where another motion of like size beats with it."
+            f"the mode cannot be isolated: at {at[backwards[0]]:.4g} s its phase runs backwards, "
+            "as in a beat with another motion of similar amplitude."
         )
     rows = np.unique([*range(0, len(at), POINTS * PER_CYCLE), len(at) - 1])
     read = local_fit(time, signal, before, at[rows], sigma, rows=True)
-    left = signal - wave_of(carrier, time)
-    noise = np.interp(at, at[rows], noise_of(left, read, sigma, time[1] - time[0])[0])
+    residual = signal - wave_of(carrier, time)
+    noise = np.interp(at, at[rows], noise_of(residual, read, sigma, time[1] - time[0])[0])
     independent = _independent(carrier.value.imag, sigma)
     weight = 1 / np.hypot(noise, _SMOOTH_ERROR)
     smooth = slow_flow(at, carrier.value, weight, independent)
@@ -113,13 +113,13 @@ def _read_from(
 
 
 def _independent(phase: np.ndarray, sigma: float) -> float:
-    """How many independent readings a phase holds, by the width of the filter."""
+    """Number of independent readings, from the bandwidth of the filter."""
     nu = np.linspace(0, 1 / sigma, 400)
     return float(np.ptp(phase)) / HERTZ * 2 * float(np.sum(passed(nu, sigma) ** 2)) * nu[1]
 
 
 def wave_of(carrier: Carrier, time: np.ndarray) -> np.ndarray:
-    """The carrier's motion; zero where there is none."""
+    """The carrier's signal; zero outside its time range."""
     inside = (time >= carrier.time[0]) & (time <= carrier.time[-1])
     wave = np.zeros_like(time)
     wave[inside] = np.exp(carrier.curve()(time[inside])).real
@@ -127,26 +127,26 @@ def wave_of(carrier: Carrier, time: np.ndarray) -> np.ndarray:
 
 
 def noise_of(
-    left: np.ndarray, read: LocalFit, sigma: float, step: float
+    residual: np.ndarray, read: LocalFit, sigma: float, step: float
 ) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray], float]:
-    """1σ that the residual's spectrum makes of ln A and of both parts of the rate.
+    """1σ of ln A and of both parts of the rate, propagated from the residual's spectrum.
 
-    Of these also what its white part makes, and that part's 1σ of a sample.
+    Also 1σ of the rate for white noise alone, and the 1σ of a sample of that noise.
     """
     width = read.level_rows.shape[1]
     index = read.first[:, None] + np.arange(width)
     taper = np.hanning(width + 2)[1:-1]
-    power = np.abs(np.fft.rfft(left[index] * taper, axis=1)) ** 2 / np.sum(taper**2)
+    power = np.abs(np.fft.rfft(residual[index] * taper, axis=1)) ** 2 / np.sum(taper**2)
     power = gaussian_filter1d(power, 1.0, axis=0, mode="nearest")
     omega = HERTZ * np.fft.rfftfreq(width, step)
     away = np.abs(omega / read.rate.imag[:, None] - 1)
-    beside = (away > _BAND) & (away < _BESIDE)
-    density = np.nanmedian(np.where(beside, power, np.nan), axis=1) / _MEDIAN_OF_POWER
+    neighbourhood = (away > _BAND) & (away < _NEIGHBOURHOOD)
+    density = np.nanmedian(np.where(neighbourhood, power, np.nan), axis=1) / _MEDIAN_OF_POWER
     inside = away <= _BAND
     nu = np.linspace(0, 1 / sigma, 400)
     gains = [np.sum((nu**k * passed(nu, sigma)) ** 2) for k in (0, 1)]
     once = [np.sum((nu**k * np.exp(-((2 * np.pi * sigma * nu) ** 2) / 2)) ** 2) for k in (0, 1)]
-    found, white = [], []
+    total, white = [], []
     for k, weights in (
         (0, read.level_rows.real), (1, read.rate_rows.real), (1, read.rate_rows.imag),
     ):  # fmt: skip
@@ -154,11 +154,11 @@ def noise_of(
         response[:, 1 : (width + 1) // 2] *= 2
         within = density * np.sum(response * inside, axis=1) * gains[k] / once[k]
         beyond = np.sum(response * ~inside * power, axis=1) * ROUNDS**2
-        found.append(np.sqrt(within + beyond))
+        total.append(np.sqrt(within + beyond))
         white.append(np.sqrt(within + density * np.sum(response * ~inside, axis=1)))
-    return found[0], found[1:], white[1:], float(np.sqrt(np.median(density)))
+    return total[0], total[1:], white[1:], float(np.sqrt(np.median(density)))
 
 
 def band_edge(sigma: float) -> float:
-    """Part of the mode's frequency beyond which the filter passes less than 1 %."""
+    """Half width of the filter's band over the mode's frequency, at a gain of 1 %."""
     return float(np.sqrt(-2 * np.log(1 - 0.99 ** (1 / ROUNDS))) / (2 * np.pi * sigma))

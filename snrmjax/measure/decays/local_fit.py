@@ -1,12 +1,12 @@
-"""A mode filter that follows the mode: local least squares of a decaying oscillation.
+"""Mode-tracking filter: local least squares of a decaying oscillation.
 
 About each instant t_k the record is fitted, with Gaussian weights of σ cycles, by
-Re[(a + b s) e^{L(t) − Re L(t_k)}] + harmonics + offset: L = ln amplitude + i·phase is the carrier
-found so far, s the time from t_k, and a, b say what it lacks. A carrier that lacks nothing has
-a = e^{L(t_k)} phase included, and b = 0; three rounds of L ← L + ln(a/…) get there, because a round
-passes a modulation of ν cycles a cycle by H(ν) = e^{−(2πσν)²/2} and n rounds by 1 − (1 − H)^n.
-The filter has no phase shift, moves with the mode, and has no ends to be cut: near the ends of
-the record the least squares go on with less data.
+Re[(a + b s) e^{L(t) − Re L(t_k)}] + harmonics + offset: L = ln amplitude + i·phase is the current
+carrier, s the time from t_k, and a, b its correction. An exact carrier has a = e^{L(t_k)}, phase
+included, and b = 0; three rounds of L ← L + ln(a/…) converge, because one round passes a
+modulation of ν cycles per cycle by H(ν) = e^{−(2πσν)²/2} and n rounds by 1 − (1 − H)^n.
+The filter has no phase shift, tracks the mode, and needs no truncation: near the ends of the
+record the least squares have less data.
 
 It is a local polynomial regression (J. Fan & I. Gijbels, Local Polynomial Modelling and Its
 Applications, 1996, chapter 3) of the demodulated record (M. Feldman, Mech. Syst. Signal Process.
@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 from scipy.interpolate import CubicSpline
 
-REACH = 3.5  # σ, at which the weights are cut
+REACH = 3.5  # σ, at which the weights are truncated
 ROUNDS = 3
-_ORDERS = (2, 3)  # harmonics beside the fundamental
-_CHUNK = 256  # instants at once
-_RIDGED = 1e-9  # of the normal equations' diagonal
+_ORDERS = (2, 3)  # harmonics in addition to the fundamental
+_CHUNK = 256  # instants per batch
+_RIDGED = 1e-9  # ridge term, of the normal equations' diagonal
 
 
 class Carrier(NamedTuple):
@@ -68,9 +68,9 @@ def local_fit(
     *,
     rows: bool = False,
 ) -> LocalFit:
-    """The record fitted about every instant `at`, by weights of `sigma` cycles.
+    """Fit the record about every instant `at`, with weights of `sigma` cycles.
 
-    `rows` asks for how each sample moves level and rate, of which standard deviations are made.
+    With `rows` also the sensitivities of level and rate to each sample, for error propagation.
     """
     curve = carrier.curve()
     whole, slope = curve(time), curve(at, 1)
@@ -95,8 +95,8 @@ def local_fit(
         wave = np.exp(relative)
         design = [wave.real, -wave.imag, cycles * wave.real, -cycles * wave.imag]
         for order in columns:
-            turn = np.exp(relative.real + 1j * order * relative.imag)
-            design += [turn.real, -turn.imag]
+            harmonic = np.exp(relative.real + 1j * order * relative.imag)
+            design += [harmonic.real, -harmonic.imag]
         design.append(np.ones_like(cycles))
         matrix = np.stack(design, axis=1)  # instant, column, sample
         weighted = matrix * weight[:, None]
@@ -112,12 +112,12 @@ def local_fit(
             of_a = (operator[:, 0] + 1j * operator[:, 1]) / a[:, None]
             of_b = (operator[:, 2] + 1j * operator[:, 3]) / a[:, None]
             kept[0].append(of_a)
-            turned = of_b - (b / a)[:, None] * of_a
-            kept[1].append(turned * (omega[part] / (2 * np.pi))[:, None])
+            of_rate = of_b - (b / a)[:, None] * of_a
+            kept[1].append(of_rate * (omega[part] / (2 * np.pi))[:, None])
     a, extra = np.concatenate(levels), np.concatenate(rates)
-    # What the carrier lacks, whose phase goes on from instant to instant.
-    lacks = a * np.exp(-here)
-    correction = np.log(np.abs(lacks)) + 1j * np.unwrap(np.angle(lacks))
+    # Correction of the carrier, with the phase unwrapped over the instants.
+    ratio = a * np.exp(-here)
+    correction = np.log(np.abs(ratio)) + 1j * np.unwrap(np.angle(ratio))
     none = np.zeros((len(at), 0), dtype=complex)
     return LocalFit(
         at,
@@ -130,5 +130,5 @@ def local_fit(
 
 
 def passed(nu: Float[np.ndarray, "..."], sigma: float) -> Float[np.ndarray, "..."]:
-    """What `ROUNDS` pass of a modulation of `nu` cycles a cycle."""
+    """Gain of `ROUNDS` rounds for a modulation of `nu` cycles per cycle."""
     return 1 - (1 - np.exp(-((2 * np.pi * sigma * nu) ** 2) / 2)) ** ROUNDS

@@ -1,9 +1,9 @@
 """The ridge of one mode in a decay's spectrogram: its frequency and amplitude, frame by frame.
 
-Frames of eight cycles of the model's mode are weighted by Hann's window. From every peak of the
-last frames a ridge is followed back in time, each step to the largest peak within the window's
-resolution of where the last steps lead. The mode is the ridge whose frequency, drawn to amplitude
-zero, is the model's within about 10 %, and that holds most energy.
+Frames of eight cycles of the model's mode are weighted by a Hann window. From every peak of the
+last frames a ridge is traced back in time, each step to the largest peak within the window's
+resolution of the linear prediction. The mode is the ridge with most energy whose frequency,
+extrapolated to amplitude zero, agrees with the model's to about 10 %.
 """
 
 from typing import NamedTuple
@@ -13,15 +13,15 @@ from jaxtyping import Float
 
 from snrmjax.numerics.units import HERTZ
 
-FRAME_CYCLES = 8  # of the model's mode in a frame
-_HOPS = 4  # frames a frame's length
+FRAME_CYCLES = 8  # of the model's mode, per frame
+_HOPS = 4  # frames per frame length
 _PADDED = 4
-_RANGE = 2.0  # times the mode's frequency, or one over it, that a ridge may begin at
-_REACH = 2.5  # times it, or one over it, that it may be led to
-_TRUST = 0.1  # 1σ of the logarithm of the model's frequency
-_ABOVE = 10.0  # times a frame's median power, which noise does not exceed once in 1000 bins
-_BEGIN = 3  # frames after another at the end of the record at which ridges begin
-_PATIENCE = 3  # frames in which a ridge may be lost
+_RANGE = 2.0  # largest ratio of a ridge's first frequency to the mode's, or its inverse
+_REACH = 2.5  # largest ratio along a ridge, or its inverse
+_TRUST = 0.1  # 1σ of the log frequency of the model
+_ABOVE = 10.0  # times a frame's median power, which noise exceeds in fewer than 1 of 1000 bins
+_BEGIN = 3  # least number of frames of a ridge
+_PATIENCE = 3  # frames in which a ridge may be missing
 
 
 class Ridge(NamedTuple):
@@ -32,7 +32,7 @@ class Ridge(NamedTuple):
     amplitude: Float[np.ndarray, " frame"]  # m/s
 
     def at_rest(self) -> float:
-        """Frequency in rad/s at amplitude zero, by a line over the amplitude squared."""
+        """Frequency in rad/s at amplitude zero, by a line over the squared amplitude."""
         last = self.frequency[-1]
         if len(self.time) < 4:
             return float(last)
@@ -42,18 +42,18 @@ class Ridge(NamedTuple):
 
 
 class SpectralPeaks(NamedTuple):
-    """SpectralPeaks of every frame: padded with NaN."""
+    """Spectral peaks of every frame, padded with NaN."""
 
     time: Float[np.ndarray, " frame"]
     frequency: Float[np.ndarray, "frame peak"]  # rad/s
     amplitude: Float[np.ndarray, "frame peak"]
-    width: float  # rad/s, of the window's main lobe, one side
+    width: float  # rad/s, half width of the window's main lobe
 
 
 def spectral_peaks(
     time: Float[np.ndarray, " sample"], signal: Float[np.ndarray, " sample"], frequency: float
 ) -> SpectralPeaks:
-    """SpectralPeaks of all frames above noise; `frequency` (rad/s) sets the frames' length."""
+    """Spectral peaks of all frames above noise; `frequency` (rad/s) sets the frame length."""
     from scipy.signal import find_peaks
 
     step = float(np.mean(np.diff(time)))
@@ -63,21 +63,21 @@ def spectral_peaks(
     window = np.hanning(length + 2)[1:-1]
     frames = np.lib.stride_tricks.sliding_window_view(signal, length)[starts]
     frames = (frames - frames.mean(axis=1, keepdims=True)) * window
-    size = 2 ** int(np.ceil(np.log2(_PADDED * length)))
-    spectrum = np.abs(np.fft.rfft(frames, size, axis=1)) * 2 / window.sum()
-    bin_width = HERTZ / (size * step)
-    found = []
+    n_fft = 2 ** int(np.ceil(np.log2(_PADDED * length)))
+    spectrum = np.abs(np.fft.rfft(frames, n_fft, axis=1)) * 2 / window.sum()
+    bin_width = HERTZ / (n_fft * step)
+    peaks = []
     for row in spectrum:
         floor = np.sqrt(_ABOVE) * np.median(row)
         at, _ = find_peaks(row, height=floor)
         at = at[(at > 0) & (at < len(row) - 1)]
         before, here, after = (np.log(row[at + k] + 1e-300) for k in (-1, 0, 1))
         shift = 0.5 * (before - after) / (before - 2 * here + after)
-        found.append(((at + shift) * bin_width, np.exp(here - 0.25 * (before - after) * shift)))
-    most = max((len(one[0]) for one in found), default=0)
-    table = np.full((2, len(found), max(most, 1)), np.nan)
-    for k, (omega, size_of) in enumerate(found):
-        table[0, k, : len(omega)], table[1, k, : len(omega)] = omega, size_of
+        peaks.append(((at + shift) * bin_width, np.exp(here - 0.25 * (before - after) * shift)))
+    most = max((len(one[0]) for one in peaks), default=0)
+    table = np.full((2, len(peaks), max(most, 1)), np.nan)
+    for k, (omega, amplitude) in enumerate(peaks):
+        table[0, k, : len(omega)], table[1, k, : len(omega)] = omega, amplitude
     middle = time[starts] + (length - 1) / 2 * step
     return SpectralPeaks(middle, table[0], table[1], 2 * HERTZ / (length * step))
 
@@ -96,10 +96,10 @@ def ridge_of_mode(peaks: SpectralPeaks, frequency: float) -> Ridge | None:
 
 
 def ridges_of(peaks: SpectralPeaks, frequency: float) -> list[Ridge]:
-    """Ridges that begin near a frequency in the last frames that have peaks, each once."""
+    """Distinct ridges that begin near a frequency in the last frames with peaks."""
     near = (peaks.frequency > frequency / _RANGE) & (peaks.frequency < frequency * _RANGE)
     frames = np.flatnonzero(near.any(axis=1))[::-1]
-    found: list[Ridge] = []
+    ridges: list[Ridge] = []
     taken = np.zeros(peaks.frequency.shape, dtype=bool)
     for frame in frames:
         for column in np.flatnonzero(near[frame] & ~taken[frame]):
@@ -107,20 +107,20 @@ def ridges_of(peaks: SpectralPeaks, frequency: float) -> list[Ridge]:
             new = ~taken[rows, columns]
             taken[rows, columns] = True
             if len(rows) >= _BEGIN and new.sum() > len(rows) / 2:
-                found.append(
+                ridges.append(
                     Ridge(
                         peaks.time[rows],
                         peaks.frequency[rows, columns],
                         peaks.amplitude[rows, columns],
                     )
                 )
-    return found
+    return ridges
 
 
 def _followed(
     peaks: SpectralPeaks, frame: int, column: int, frequency: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames and columns of a ridge that is followed back from one peak."""
+    """Frames and columns of a ridge traced back from one peak."""
     rows, columns = [frame], [column]
     for k in range(frame - 1, -1, -1):
         if rows[-1] - k > _PATIENCE:
@@ -128,10 +128,10 @@ def _followed(
         last = peaks.frequency[rows[-1], columns[-1]]
         old = min(len(rows), _HOPS) - 1
         before = peaks.frequency[rows[-1 - old], columns[-1 - old]]
-        lead = last
+        predicted = last
         if old:
-            lead = last + (last - before) * (rows[-1] - k) / (rows[-1 - old] - rows[-1])
-        off = np.minimum(np.abs(peaks.frequency[k] - lead), np.abs(peaks.frequency[k] - last))
+            predicted = last + (last - before) * (rows[-1] - k) / (rows[-1 - old] - rows[-1])
+        off = np.minimum(np.abs(peaks.frequency[k] - predicted), np.abs(peaks.frequency[k] - last))
         inside = (off < peaks.width / 2) & (peaks.frequency[k] < _REACH * frequency)
         inside &= peaks.frequency[k] > frequency / _REACH
         if inside.any():

@@ -1,11 +1,10 @@
-"""The smooth decay of one mode: rates of amplitude and phase as functions of the amplitude alone.
+"""The slow flow of one mode: rates of amplitude and phase as functions of the amplitude alone.
 
 d ln A/dt = Σ d_j A^j and dφ/dt = Σ w_j A^j, j = −1…: dry friction (−1), viscous damping (0),
-damping by v|v| (1), cubic and quintic forces (2, 4) and what lies between. Integrated along the
-decay they are columns of a linear least squares for ln A and φ, and Schwarz' criterion says how
-many. One mode can follow few other curves: a beat, at which frequency and amplitude swing while
-the amplitude falls, is not among them, so that what they leave is company, noise and error of the
-reading.
+damping by v|v| (1), cubic and quintic forces (2, 4) and those in between. Integrated along the
+decay they are columns of a linear least-squares problem for ln A and φ; Schwarz' criterion selects
+their number. A beat, in which frequency and amplitude oscillate during the decay, is not in their
+span, so that the residual contains interfering modes, noise and errors of the reading.
 """
 
 from typing import NamedTuple
@@ -15,18 +14,18 @@ from jaxtyping import Complex, Float
 from numpy.polynomial import chebyshev
 from scipy.interpolate import CubicSpline
 
-_FEWEST, _MOST = 3, 9  # functions of the amplitude: the first is 1/A
+_FEWEST, _MOST = 3, 9  # number of functions of the amplitude: the first is 1/A
 _ROUNDS = 5
-_LEAST = 0.02  # of the largest amplitude, below which 1/A is held
+_LEAST = 0.02  # of the largest amplitude, below which 1/A is constant
 
 
 class SlowFlow(NamedTuple):
-    """The smooth decay at the instants of a reading."""
+    """The smooth decay at the times of a reading."""
 
     level: Complex[np.ndarray, " k"]  # ln amplitude + i phase
     rate: Complex[np.ndarray, " k"]  # −decay + iω
-    bend: Complex[np.ndarray, " k"]  # its derivative
-    off: Complex[np.ndarray, " k"]  # reading over smooth decay, less one
+    rate_derivative: Complex[np.ndarray, " k"]
+    deviation: Complex[np.ndarray, " k"]  # reading over smooth decay, minus one
 
 
 def slow_flow(
@@ -37,10 +36,10 @@ def slow_flow(
 ) -> SlowFlow:
     """Fit the smooth decay to readings `level` with weights (1/σ of ln A and φ).
 
-    `independent` is how many of the readings are, for the criterion.
+    `independent` is the number of independent readings, for the criterion.
     """
-    away = (time - time.mean()) / max(float(np.ptp(time)), 1e-300)
-    start = np.polyval(np.polyfit(away, level.real, min(3, len(time) - 1), w=weight), away)
+    scaled = (time - time.mean()) / max(float(np.ptp(time)), 1e-300)
+    start = np.polyval(np.polyfit(scaled, level.real, min(3, len(time) - 1), w=weight), scaled)
     best, least = None, np.inf
     for terms in range(_FEWEST, _MOST + 1):
         if terms + 1 > independent and best is not None:
@@ -57,21 +56,21 @@ def slow_flow(
 def _fitted(
     time: np.ndarray, level: np.ndarray, weight: np.ndarray, smooth: np.ndarray, terms: int
 ) -> tuple[SlowFlow, float]:
-    """The smooth decay of some functions of the amplitude, and what it leaves."""
+    """The smooth decay with some functions of the amplitude, and its mean square residual."""
     target = np.stack([level.real, level.imag], axis=1) * weight[:, None]
     for _ in range(_ROUNDS):
-        size = np.exp(smooth - smooth.max())
-        held = np.maximum(size, _LEAST)
-        smoothly = chebyshev.chebvander(2 * size - 1, terms - 2)
-        rates = np.concatenate([1 / held[:, None], smoothly], axis=1)
-        grown = CubicSpline(time, rates).antiderivative()(time)
-        design = np.concatenate([np.ones((len(time), 1)), grown], axis=1) * weight[:, None]
-        length = np.linalg.norm(design, axis=0)
-        solved = np.linalg.lstsq(design / length, target, rcond=1e-9)[0] / length[:, None]
-        fitted = design / weight[:, None] @ solved
+        amplitude = np.exp(smooth - smooth.max())
+        bounded = np.maximum(amplitude, _LEAST)
+        polynomials = chebyshev.chebvander(2 * amplitude - 1, terms - 2)
+        rates = np.concatenate([1 / bounded[:, None], polynomials], axis=1)
+        integrals = CubicSpline(time, rates).antiderivative()(time)
+        design = np.concatenate([np.ones((len(time), 1)), integrals], axis=1) * weight[:, None]
+        norm = np.linalg.norm(design, axis=0)
+        coefficients = np.linalg.lstsq(design / norm, target, rcond=1e-9)[0] / norm[:, None]
+        fitted = design / weight[:, None] @ coefficients
         smooth = np.minimum(fitted[:, 0], fitted[0, 0] + 1.0)
     flow = fitted[:, 0] + 1j * fitted[:, 1]
-    rate = rates @ (solved[1:, 0] + 1j * solved[1:, 1])
-    bend = CubicSpline(time, rate).derivative()(time)
-    left = float(np.mean((design @ solved - target) ** 2))
-    return SlowFlow(flow, rate, bend, np.exp(level - flow) - 1), left
+    rate = rates @ (coefficients[1:, 0] + 1j * coefficients[1:, 1])
+    derivative = CubicSpline(time, rate).derivative()(time)
+    square = float(np.mean((design @ coefficients - target) ** 2))
+    return SlowFlow(flow, rate, derivative, np.exp(level - flow) - 1), square

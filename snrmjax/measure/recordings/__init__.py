@@ -1,1 +1,1 @@
-"""What a laboratory records: channels, time records and frequency responses."""
+"""Laboratory data: channels, time records and frequency responses."""

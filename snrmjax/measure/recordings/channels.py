@@ -1,4 +1,4 @@
-"""A channel of a test: what was measured, in which unit, where and in which direction."""
+"""A channel of a test: quantity, unit, point and direction."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
@@ -15,18 +15,18 @@ SI_UNIT: dict[Quantity, str] = {
     "voltage": "V",
     "unknown": "",
 }
-"""The unit of each quantity in which all of the package computes."""
+"""The unit of each quantity in all computations."""
 
 DERIVATIVE: dict[Quantity, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
-"""Which derivative of the displacement a quantity of motion is."""
+"""Order of each motion quantity as a derivative of the displacement."""
 
 
 class Channel(NamedTuple):
     """One channel of a recording.
 
-    A recorded number times `calibration` is in the SI unit of `quantity`. `unit` is the file's own
-    word for its numbers. `point` and `direction` say where (a node's number or a name; +x, -z, …);
-    they are empty where nobody said.
+    A recorded number times `calibration` is in the SI unit of `quantity`. `unit` is the unit as
+    written in the file. `point` (a node number or a name) and `direction` (+x, -z, …) are empty if
+    unknown.
     """
 
     name: str
@@ -38,20 +38,20 @@ class Channel(NamedTuple):
 
     @property
     def si_unit(self) -> str:
-        """SI unit of what `calibration` gives."""
+        """SI unit of the calibrated values."""
         return SI_UNIT[self.quantity]
 
     def __str__(self) -> str:
-        """In words: name, quantity and place."""
-        place = f" at {self.point}{self.direction}" if self.point or self.direction else ""
+        """As text: name, quantity, unit and point."""
+        location = f" at {self.point}{self.direction}" if self.point or self.direction else ""
         unit = f", {self.unit}" if self.unit else ""
-        return f"{self.name} ({self.quantity}{unit}{place})"
+        return f"{self.name} ({self.quantity}{unit}{location})"
 
 
 def checked_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """Channels of one recording as a tuple.
 
-    Raises `ValueError` for none, for a doubled or empty name, an unknown quantity, and a
+    Raises `ValueError` for no channel, a repeated or empty name, an unknown quantity, and a
     calibration that is zero or not finite.
     """
     listed = tuple(channels)
@@ -60,7 +60,7 @@ def checked_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     names = [channel.name for channel in listed]
     for channel in listed:
         if not channel.name or names.count(channel.name) > 1:
-            raise ValueError(f"channels need names of their own, but are {', '.join(names)}.")
+            raise ValueError(f"channels need distinct names, but are {', '.join(names)}.")
         if channel.quantity not in get_args(Quantity):
             raise ValueError(
                 f"the quantity of channel {channel.name} must be one of {', '.join(SI_UNIT)}, but "
@@ -71,7 +71,7 @@ def checked_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
 
 
 def channel_number(channels: Sequence[Channel], name: str) -> int:
-    """Where the channel of a name stands. Raises `ValueError` that lists the names there are."""
+    """Index of a channel by name. Raises `ValueError` that lists the existing names."""
     names = [channel.name for channel in channels]
     if name not in names:
         raise ValueError(f"there is no channel {name!r}; there are {', '.join(names)}.")

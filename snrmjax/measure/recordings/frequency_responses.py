@@ -1,4 +1,4 @@
-"""Frequency responses of a linear test: response over reference, by frequency."""
+"""Frequency response functions of a linear test: response over reference."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -24,7 +24,7 @@ class FrequencyResponses(AbstractResult):
 
     responses: tuple[Channel, ...] = eqx.field(static=True)
     references: tuple[Channel, ...] = eqx.field(static=True)
-    # Rising.
+    # Ascending.
     frequency: Float[np.ndarray, " frequency"] = quantity("frequency_hz", "Hz", "frequency")
     values: Complex[np.ndarray, "response reference frequency"] = quantity(
         "response reference frequency_hz", "SI", "response", name="value"
@@ -40,17 +40,17 @@ class FrequencyResponses(AbstractResult):
     def receptance(self) -> Complex[np.ndarray, "response reference frequency"]:
         """Displacement over reference: velocities over iΩ, accelerations over −Ω².
 
-        Raises `ValueError` for a response of another quantity.
+        Raises `ValueError` for a response that is not a motion.
         """
-        turned = []
+        receptances = []
         for channel, row in zip(self.responses, self.values, strict=True):
             if channel.quantity not in DERIVATIVE:
                 raise ValueError(
                     f"channel {channel.name} must be a displacement, velocity or acceleration, but "
                     f"is {channel.quantity}."
                 )
-            turned.append(row / (1j * self.frequency) ** DERIVATIVE[channel.quantity])
-        return np.stack(turned)
+            receptances.append(row / (1j * self.frequency) ** DERIVATIVE[channel.quantity])
+        return np.stack(receptances)
 
     def summary(self) -> tuple[str, ...]:
         """Channels and band."""
@@ -65,7 +65,7 @@ class FrequencyResponses(AbstractResult):
         )
 
     def variables(self) -> dict[str, Variable]:
-        """By channels and frequency."""
+        """Columns by channels and frequency."""
         return {
             "response": channel_variable("response", self.responses),
             "reference": channel_variable("reference", self.references),
@@ -90,11 +90,11 @@ def frequency_responses(
     name: str = "",
     notes: Sequence[Fact | str] = (),
 ) -> FrequencyResponses:
-    """Frequency responses, checked.
+    """Build `FrequencyResponses` from arrays, with checks.
 
-    Arguments: `frequency` in rad/s, rising; `values` in the channels' own units, (response) over
-    (reference): their calibrations turn them into SI.
-    Raises `ValueError` for sizes that disagree, frequencies that do not rise from zero or above,
+    Arguments: `frequency` in rad/s, ascending; `values` in the channels' own units, (response)
+    over (reference), converted to SI by the calibrations.
+    Raises `ValueError` for inconsistent shapes, frequencies that do not ascend from zero or above,
     channels as in `checked_channels`, infinite values and no value at all.
     """
     omega, numbers = np.asarray(frequency, dtype=float), np.asarray(values, dtype=complex)
@@ -111,7 +111,7 @@ def frequency_responses(
         or omega[0] < 0
         or np.any(np.diff(omega) <= 0)
     ):
-        raise ValueError("`frequency` must be finite and rise from zero or above.")
+        raise ValueError("`frequency` must be finite and ascending from zero or above.")
     if np.isinf(numbers).any() or np.isnan(numbers).all():
         raise ValueError("`values` must be finite where they were measured, and not all missing.")
     known = np.full(wanted, np.nan) if coherence is None else np.asarray(coherence, dtype=float)

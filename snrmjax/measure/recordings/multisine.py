@@ -1,7 +1,7 @@
 """Frequency responses from periodic multisines.
 
-Whatever repeats from period to period is signal, the rest is noise; whatever differs from one
-realisation of random phases to the next beyond noise is nonlinear.
+The part that repeats from period to period is signal, the rest is noise; differences between
+realisations of random phases beyond noise are nonlinear distortions.
 
 Reference: R. Pintelon & J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.
 (2012), section 4.3 (robust and fast method for the best linear approximation).
@@ -19,19 +19,19 @@ from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.units import HERTZ
 
-_EXCITED = 0.03  # of the largest line of the force, that an excited line has at least
-_SURE = 25.0  # and so many variances of its mean above noise
-_MOST_SAMPLES = 2**21  # from whose start a period is sought
-_REPEATS = 0.5  # least correlation of a record with itself a period later
-_BEST = 0.9  # of the best correlation: the first lag of so much is the period
-_OFF = 0.05  # samples by which a period may miss a whole number
+_EXCITED = 0.03  # of the largest line of the force, least amplitude of an excited line
+_SURE = 25.0  # and least power over the variance of its mean
+_MOST_SAMPLES = 2**21  # searched for a period
+_REPEATS = 0.5  # least autocorrelation at a lag of one period
+_BEST = 0.9  # of the largest autocorrelation: the first such lag is the period
+_OFF = 0.05  # samples, permitted deviation of a period from a whole number
 
 
 class MultisineResponses(AbstractResult):
     """Best linear approximation of multisine tests, and its errors.
 
-    Standard deviations are rms of the complex errors of the means. `total_std` holds nonlinear
-    scatter from realisation to realisation too; NaN for one realisation.
+    Standard deviations are rms of the complex errors of the means. `total_std` includes nonlinear
+    scatter between realisations; NaN for a single one.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz", "response")
@@ -61,7 +61,7 @@ class MultisineResponses(AbstractResult):
         return tuple(lines)
 
     def variables(self) -> dict[str, Variable]:
-        """By response and line, with the linear approximation."""
+        """Columns by response and line, with the linear approximation."""
         at, linear = ("response", "frequency_hz"), self.responses.variables()
         values = {
             name: linear[name]._replace(dimensions=at, values=linear[name].values[:, 0])
@@ -90,15 +90,15 @@ def multisine_responses(
 ) -> MultisineResponses:
     """Best linear approximation from several periods and realisations of a multisine.
 
-    G(k) is the mean over realisations of the ratio of the spectra's means over periods. Only one
-    period is held in memory.
+    G(k) is the mean over realisations of the ratio of the period-averaged spectra. Only one period
+    at a time is in memory.
 
-    Arguments: `recordings`, one a realisation of random phases, with the same channels and rate;
-    `force` and `responses` by their channels' names; `period` in s, found where it is not stated;
-    `skip` periods at the start of each record are left out, until the transient is over; `lines`
-    in rad/s are the excited ones, found where they are not stated.
-    Returns `MultisineResponses`. Raises `ValueError` for channels or rates that differ, a period
-    that is not found or no whole number of samples, fewer than two periods after those left out,
+    Arguments: `recordings`, one per realisation of random phases, with the same channels and rate;
+    `force` and `responses` by their channels' names; `period` in s, by default detected; `skip`
+    periods at the start of each record are discarded for the transient; `lines` in rad/s are the
+    excited ones, by default detected.
+    Returns `MultisineResponses`. Raises `ValueError` for different channels or rates, a period
+    that is not detected or not a whole number of samples, fewer than two remaining periods,
     lines between multiples of 1/period, no excited line, and samples that are not finite.
     Reference: Pintelon & Schoukens (2012), section 4.3.
     """
@@ -106,7 +106,7 @@ def multisine_responses(
     names = (force, *((responses,) if isinstance(responses, str) else tuple(responses)))
     _check(records, names, skip)
     rate = records[0].sampling_rate
-    samples = _found_period(records[0], force) if period is None else _stated(period, rate)
+    samples = _detected_period(records[0], force) if period is None else _stated(period, rate)
     spectra = [_spectra(record, names, samples, skip) for record in records]
     periods = min(record.periods for record in spectra)
     excited = _lines(lines, spectra[0], rate, samples)
@@ -147,7 +147,7 @@ class _Spectra(NamedTuple):
 
 def _check(records: tuple[TimeRecording, ...], names: tuple[str, ...], skip: int) -> None:
     if not records:
-        raise ValueError("`recordings` must hold one realisation at least, but is empty.")
+        raise ValueError("`recordings` must have at least one realisation, but is empty.")
     if len(names) < 2 or len(set(names)) != len(names):
         raise ValueError(f"name a force and other channels as responses, not {', '.join(names)}.")
     for record in records:
@@ -163,7 +163,7 @@ def _check(records: tuple[TimeRecording, ...], names: tuple[str, ...], skip: int
 
 
 def _in_si(recording: TimeRecording, name: str) -> Channel:
-    """The channel as its values are read: in SI units already."""
+    """The channel of values that are already in SI units."""
     channel = recording.channels[channel_number(recording.channels, name)]
     return channel._replace(calibration=1.0)
 
@@ -172,13 +172,13 @@ def _stated(period: float, rate: float) -> int:
     samples = round(period * rate) if np.isfinite(period) else 0
     if samples < 4 or abs(period * rate - samples) > 1e-3:
         raise ValueError(
-            f"`period` must be a whole number of samples, four at least, but {period:g} s are "
+            f"`period` must be a whole number of samples (4 or more), but {period:g} s are "
             f"{period * rate:g}."
         )
     return samples
 
 
-def _found_period(recording: TimeRecording, force: str) -> int:
+def _detected_period(recording: TimeRecording, force: str) -> int:
     values = recording.values([force], 0, _MOST_SAMPLES)[0]
     if not np.isfinite(values).all():
         raise ValueError(f"channel {force} has samples that are not finite.")
@@ -186,30 +186,30 @@ def _found_period(recording: TimeRecording, force: str) -> int:
     n = len(values)
     spectrum = np.abs(np.fft.rfft(values, 2 * n)) ** 2
     lags = np.arange(n // 2)
-    likeness = np.fft.irfft(spectrum)[: n // 2] / (n - lags)
-    likeness /= max(likeness[0], np.finfo(float).tiny)
-    # Beyond the first fall: near lag zero everything is like itself.
-    falls = np.flatnonzero(likeness < _REPEATS)
+    correlation = np.fft.irfft(spectrum)[: n // 2] / (n - lags)
+    correlation /= max(correlation[0], np.finfo(float).tiny)
+    # Beyond the first drop: every signal is correlated near lag zero.
+    falls = np.flatnonzero(correlation < _REPEATS)
     after = int(falls[0]) if falls.size else n // 2
-    best = likeness[after:].max(initial=0.0)
+    best = correlation[after:].max(initial=0.0)
     if best < _REPEATS:
         raise ValueError(
-            f"no period is found in channel {force}: it does not repeat within half the record; "
-            "state `period`."
+            f"no period in channel {force}: it does not repeat within half the record; state "
+            "`period`."
         )
-    late = likeness[after:]
+    late = correlation[after:]
     inner = np.flatnonzero(
         (late[1:-1] >= late[:-2]) & (late[1:-1] >= late[2:]) & (late[1:-1] >= _BEST * best)
     )
     if not inner.size:
-        raise ValueError(f"no period is found in channel {force}; state `period`.")
+        raise ValueError(f"no period in channel {force}; state `period`.")
     lag = after + 1 + int(inner[0])
-    a, b, c = likeness[lag - 1 : lag + 2]
+    a, b, c = correlation[lag - 1 : lag + 2]
     off = 0.5 * (a - c) / (a - 2 * b + c)
     if abs(off) > _OFF:
         raise ValueError(
-            f"the period of channel {force}, about {lag + off:.2f} samples, is no whole number of "
-            "samples: sample in step with the generator, or state `period`."
+            f"the period of channel {force}, about {lag + off:.2f} samples, is not a whole "
+            "number: sample in step with the generator, or state `period`."
         )
     return lag
 
@@ -218,7 +218,7 @@ def _spectra(recording: TimeRecording, names: tuple[str, ...], samples: int, ski
     count = recording.n_samples // samples - skip
     if count < 2:
         raise ValueError(
-            f"two periods are needed after the {skip} left out, but the record has "
+            f"two periods are needed after the {skip} discarded, but the record has "
             f"{recording.n_samples / samples:.3g} of {samples / recording.sampling_rate:.4g} s."
         )
     total = np.zeros((len(names), samples // 2 + 1), dtype=complex)
@@ -231,7 +231,7 @@ def _spectra(recording: TimeRecording, names: tuple[str, ...], samples: int, ski
             raise ValueError(f"period {k} of the record has samples that are not finite.")
         spectrum = 2 / samples * np.fft.rfft(values, axis=1)
         first = spectrum if k == skip else first
-        away = spectrum - first  # small numbers: nothing is lost in the squares
+        away = spectrum - first  # relative to the first: no cancellation in the squares
         total += away
         squares += np.abs(away) ** 2
         mixed += away * away[0].conj()
@@ -253,19 +253,21 @@ def _lines(
     """Numbers of the excited lines."""
     highest = spectra.mean.shape[1] - 1
     if lines is not None:
-        place = np.asarray(lines, dtype=float) * samples / rate / HERTZ
-        number = np.unique(np.round(place).astype(int))
-        if not place.size or np.any(np.abs(place - np.round(place)) > 1e-3):
+        position = np.asarray(lines, dtype=float) * samples / rate / HERTZ
+        number = np.unique(np.round(position).astype(int))
+        if not position.size or np.any(np.abs(position - np.round(position)) > 1e-3):
             raise ValueError("`lines` must be multiples of 1/period (in rad/s: times 2π).")
         if number[0] < 1 or number[-1] >= highest:
             raise ValueError("`lines` must lie between 0 and half the sampling rate.")
         return number
-    size = np.abs(spectra.mean[0])
-    size[0] = 0.0
+    amplitude = np.abs(spectra.mean[0])
+    amplitude[0] = 0.0
     noise = spectra.variance[0] / spectra.periods
-    excited = np.flatnonzero((size > _EXCITED * size.max()) & (size**2 > _SURE * noise))
-    if not excited.size or size.max() == 0:
-        raise ValueError("no line of the force stands out of its noise: nothing is excited.")
+    excited = np.flatnonzero(
+        (amplitude > _EXCITED * amplitude.max()) & (amplitude**2 > _SURE * noise)
+    )
+    if not excited.size or amplitude.max() == 0:
+        raise ValueError("no line of the force exceeds its noise: nothing is excited.")
     return excited
 
 

@@ -1,4 +1,4 @@
-"""Free decays in a record: where the drive stops and the structure rings down."""
+"""Free decays in a record: stretches of ring-down after the drive stops."""
 
 from typing import NamedTuple
 
@@ -9,34 +9,34 @@ from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.rules import BETWEEN_ZERO_AND_ONE, require
 
-_BLOCK = 2**18  # samples read at once
-_FRAME = 2  # cycles of the response over which the drive's largest value is taken
-_BEFORE = 6  # frames before a stop that say how large the drive was
-_FADING = 3  # frames in which a drive that stops is gone
-_LOUD = 0.01  # of the largest drive: below, nothing stops
+_BLOCK = 2**18  # samples per block
+_FRAME = 2  # cycles of the response per value of the drive's envelope
+_BEFORE = 6  # frames before a stop, for the level of the drive
+_FADING = 3  # frames in which a stopping drive decays
+_LOUD = 0.01  # of the largest drive: smaller ones are ignored
 _FEWEST_CYCLES = 12
 
 
 class RingDown(NamedTuple):
-    """A stretch of a record in which nothing drives."""
+    """A stretch of a record without excitation."""
 
     start: int  # sample
     stop: int  # sample, exclusive
-    frequency: float  # rad/s, about, of the response before it
+    frequency: float  # rad/s, approximate, of the response before it
     drive: float  # largest value of the drive before it, SI
 
 
 def find_ring_downs(
     recording: TimeRecording, drive: str, response: str, *, quiet: float = 0.05
 ) -> list[RingDown]:
-    """Stretches of free decay: after the drive falls to `quiet` of what it was, until it is back.
+    """Stretches of free decay, from the drop of the drive to `quiet` of its level to its return.
 
-    Arguments: `drive` names the channel that says when the structure is free, best the voltage of
-    the generator or a hammer's force (the force of a shaker that stays attached goes on with the
-    decay); `response` a channel that rings; `quiet` is a share of the drive before it stopped.
+    Arguments: `drive` names the channel of the excitation, best the voltage of the generator or a
+    hammer's force (the force of an attached shaker continues during the decay); `response` a
+    channel of the motion; `quiet` is a fraction of the drive before it stopped.
     Returns `RingDown`s in the order of time, each of twelve cycles or more.
-    Raises `ValueError` for channels that are not there, a `quiet` not between 0 and 1, no tone in
-    the response, and a drive that never stops for so long.
+    Raises `ValueError` for unknown channels, a `quiet` not between 0 and 1, no tone in the
+    response, and a drive that never stops for twelve cycles.
 
     >>> from snrmjax.measure import Channel, time_recording
     >>> t = np.arange(4000) / 1000
@@ -52,21 +52,21 @@ def find_ring_downs(
     require("`quiet`", quiet, BETWEEN_ZERO_AND_ONE)
     step = _strongest(recording, response)
     length = max(8, round(_FRAME * 2 * np.pi / step))
-    offset, size = _envelope(recording, drive, length)
+    offset, envelope = _envelope(recording, drive, length)
     decays = [
         _at_sample(recording, drive, offset, length, rows, level, quiet, step)
-        for rows, level in _stops(size, quiet, max(1, round(_FEWEST_CYCLES / _FRAME)))
+        for rows, level in _stops(envelope, quiet, max(1, round(_FEWEST_CYCLES / _FRAME)))
     ]
     if not decays:
         raise ValueError(
             f"channel {drive} never stops for {_FEWEST_CYCLES} cycles: it does not fall to "
-            f"{100 * quiet:g} % of what it was (noise above that? state a larger `quiet`)."
+            f"{100 * quiet:g} % of its level (noise above that? state a larger `quiet`)."
         )
     return decays
 
 
 def _strongest(recording: TimeRecording, name: str) -> float:
-    """Frequency of the strongest line of the loudest block, rad a sample."""
+    """Frequency of the strongest line of the block with most power, rad per sample."""
     loudest, frequency = 0.0, 0.0
     for block in recording.blocks(_BLOCK, [name]):
         values = np.where(np.isfinite(block.values[0]), block.values[0], 0.0)
@@ -76,38 +76,38 @@ def _strongest(recording: TimeRecording, name: str) -> float:
             spectrum[:2] = 0.0
             loudest, frequency = power, 2 * np.pi * float(np.argmax(spectrum)) / len(values)
     if frequency == 0:
-        raise ValueError(f"channel {name} does not move: there is nothing that rings down.")
+        raise ValueError(f"channel {name} does not move: there is no free decay.")
     return frequency
 
 
 def _envelope(
     recording: TimeRecording, name: str, length: int
 ) -> tuple[float, Float[np.ndarray, " frame"]]:
-    """Median of the drive's first block and the largest distance from it in every frame."""
-    offset, sizes = None, []
+    """Median of the drive's first block and the largest deviation from it in every frame."""
+    offset, largest = None, []
     for block in recording.blocks(_BLOCK // length * length + length, [name]):
         values = block.values[0]
         if offset is None:
             offset = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
         whole = len(values) // length * length
         away = np.abs(values[:whole] - offset).reshape(-1, length)
-        sizes.append(np.where(np.isfinite(away), away, np.inf).max(axis=1))
-    return offset or 0.0, np.concatenate(sizes)
+        largest.append(np.where(np.isfinite(away), away, np.inf).max(axis=1))
+    return offset or 0.0, np.concatenate(largest)
 
 
 def _stops(
-    size: Float[np.ndarray, " frame"], quiet: float, fewest: int
+    envelope: Float[np.ndarray, " frame"], quiet: float, fewest: int
 ) -> list[tuple[slice, float]]:
-    """Frames of silence, and how large the drive was before."""
-    finite = size[np.isfinite(size)]
+    """Frames without drive, and the level of the drive before."""
+    finite = envelope[np.isfinite(envelope)]
     least = _LOUD * float(finite.max(initial=0.0))
-    stops, k, n = [], 1, len(size)
+    stops, k, n = [], 1, len(envelope)
     while k < n:
-        level = float(size[max(0, k - _BEFORE) : k].max())
-        if not (np.isfinite(level) and level > least and size[k] <= quiet * level):
+        level = float(envelope[max(0, k - _BEFORE) : k].max())
+        if not (np.isfinite(level) and level > least and envelope[k] <= quiet * level):
             k += 1
             continue
-        louder = np.flatnonzero(size[k:] > quiet * level)
+        louder = np.flatnonzero(envelope[k:] > quiet * level)
         end = k + int(louder[0]) if louder.size else n
         if end - k >= fewest:
             stops.append((slice(k, end), level))
@@ -125,12 +125,12 @@ def _at_sample(
     quiet: float,
     step: float,
 ) -> RingDown:
-    """The stretch to the sample: after the drive's last value above `quiet`."""
+    """The stretch with sample accuracy, after the drive's last value above `quiet`."""
     first = max(0, (rows.start - _FADING) * length)
     near = np.abs(recording.values([drive], first, rows.start * length + length)[0] - offset)
-    loud = np.flatnonzero(near > quiet * level)
-    start = first + (int(loud[-1]) + 1 if loud.size else 0)
-    # A stretch that nothing ends goes on to the last sample, also beyond the last whole frame.
+    active = np.flatnonzero(near > quiet * level)
+    start = first + (int(active[-1]) + 1 if active.size else 0)
+    # The last stretch extends to the last sample, also beyond the last complete frame.
     frames = recording.n_samples // length
     stop = recording.n_samples if rows.stop >= frames else rows.stop * length
     return RingDown(start, stop, step * recording.sampling_rate, level)

@@ -1,8 +1,8 @@
-"""The settled part of a step, and the mean phasors there with errors that hold for coloured noise.
+"""The settled part of a step, and its mean phasors with errors valid for coloured noise.
 
 After a step every phasor is z(t) = z∞ + c e^{−t/τ + iδt}: one decaying mode, which beats with the
-drive. τ and δ are sought on a grid for all channels together, z∞ and c follow by least squares.
-What is left of c at a time says how much of the step has to be left out.
+drive. τ and δ are searched on a grid for all channels together, z∞ and c follow by least squares.
+The start of the settled part follows from the remaining transient.
 """
 
 from typing import NamedTuple
@@ -12,26 +12,26 @@ from jaxtyping import Complex, Float
 
 from snrmjax.measure.recordings.block_phasors import BlockPhasors
 
-_BLOCKS = 64  # into which the blocks are joined to look for a transient
+_BLOCKS = 64  # after averaging, for the detection of a transient
 _DECAYS, _BEATS = 12, 41  # points of the grid
 _ZOOMS = 14  # finer grids about the best point
-_SURE = 15.0  # half the gain in squared standard deviations from which on a transient is believed
-_FEWEST = 6  # blocks that are kept
-_LEAST_KEPT = 0.2  # of the step
-_LEAST_LEFT_OUT = 0.15  # of the step where cycles are many
-_ROUNDING = 1e-7  # relative: what moves less has not moved
-_CHANCE = 1e-4  # of a trend that is believed
+_SURE = 15.0  # half the gain in squared standard deviations for a significant transient
+_FEWEST = 6  # least number of blocks used
+_LEAST_KEPT = 0.2  # least fraction of the step used
+_LEAST_LEFT_OUT = 0.15  # least fraction of the step discarded, if it is long
+_ROUNDING = 1e-7  # relative: smaller changes are ignored
+_CHANCE = 1e-4  # significance level of a trend
 _BATCHES = 16
-_FEW_BATCHES = 12  # below which Student's distribution widens the scatter
+_FEW_BATCHES = 12  # below which Student's distribution is used for the scatter
 
 
 class Settled(NamedTuple):
-    """From which block on a step is settled, and what is left of its transient there."""
+    """The first settled block of a step, and the remaining transient."""
 
     first: int  # block
-    latest: int  # block from which on a step is used at the latest
-    left: Float[np.ndarray, "channel block"]  # mean of the transient from each block on, SI
-    decay_time: float  # s, NaN where no transient was seen
+    latest: int  # latest possible first block
+    remaining: Float[np.ndarray, "channel block"]  # mean of the transient from each block on, SI
+    decay_time: float  # s, NaN if no transient was detected
 
 
 class Means(NamedTuple):
@@ -46,9 +46,9 @@ class Means(NamedTuple):
 
 
 def steady_frequency(blocks: BlockPhasors, channel: int = 0) -> float:
-    """By how much (rad/s) the tone of a channel is faster than the blocks' frequency.
+    """Frequency of the tone of a channel relative to that of the blocks, rad/s.
 
-    From the last two thirds: a straight line of phase.
+    From a linear fit to the phase of the last two thirds.
     """
     late = slice(len(blocks.time) // 3, None)
     phasor = blocks.phasors[channel, 0, late]
@@ -60,9 +60,9 @@ def steady_frequency(blocks: BlockPhasors, channel: int = 0) -> float:
 
 
 def settled_part(blocks: BlockPhasors, skip: float | None) -> Settled:
-    """Where the transient of a step is over.
+    """Find the end of the transient of a step.
 
-    Arguments: `skip` in s leaves out so much and looks no further.
+    Arguments: `skip` in s is discarded instead of a detected transient.
     """
     count = len(blocks.time)
     most = max(0, min(count - _FEWEST, int(count * (1 - _LEAST_KEPT))))
@@ -71,10 +71,10 @@ def settled_part(blocks: BlockPhasors, skip: float | None) -> Settled:
         first = int(np.searchsorted(blocks.time, begin + skip))
         return Settled(first, first, np.zeros((len(blocks.phasors), count)), np.nan)
     times, series = _joined(blocks.time, blocks.phasors[:, 0, :])
-    # Scatter from block to block, free of trends, weighs the channels.
+    # Channels are weighted by the trend-free scatter between blocks.
     noise = np.mean(np.abs(np.diff(series, 2, axis=1)) ** 2, axis=1) / 6 if len(times) > 2 else 0.0
-    size = np.abs(series).mean(axis=1)
-    weight = 1 / np.sqrt(np.maximum(noise, (_ROUNDING * size) ** 2 + np.finfo(float).tiny))
+    magnitude = np.abs(series).mean(axis=1)
+    weight = 1 / np.sqrt(np.maximum(noise, (_ROUNDING * magnitude) ** 2 + np.finfo(float).tiny))
     away = times - times[0]
     span = max(float(away[-1]), np.finfo(float).tiny)
     rest = (series - series.mean(axis=1, keepdims=True)) * weight[:, None]
@@ -91,13 +91,13 @@ def settled_part(blocks: BlockPhasors, skip: float | None) -> Settled:
     if gains[best] < 2 * _SURE * scale * max(1, len(rest) / 2):
         return Settled(least, most, np.zeros((len(rest), count)), np.nan)
     whole = np.exp((-1 / decay + 1j * beat) * (blocks.time - times[0]))
-    # Of the means from each block on: what is left of the transient, and the noise.
+    # For the means from each block on: the remaining transient, and the noise.
     counts = np.arange(count, 0, -1)
     means = np.abs(np.cumsum(whole[::-1])[::-1] / counts)
     transient = np.abs(projected[:, best]) / weight
     random = np.sqrt(scale) / weight[:, None] * np.sqrt(count / len(times) / counts)
-    allowed = np.maximum(0.3 * random, _ROUNDING * size[:, None])
-    # Within a beat the mean may pass through zero: the envelope counts where it is smaller still.
+    allowed = np.maximum(0.3 * random, _ROUNDING * magnitude[:, None])
+    # Within a beat the mean may cross zero: it must not be below a tenth of the envelope.
     envelope = np.maximum(means, 0.1 * np.abs(whole))
     enough = np.all(transient[:, None] * envelope <= allowed, axis=0)
     late = np.flatnonzero(enough[: most + 1])
@@ -106,9 +106,9 @@ def settled_part(blocks: BlockPhasors, skip: float | None) -> Settled:
 
 
 def moves(blocks: BlockPhasors, tolerance: float) -> float:
-    """Largest trend of amplitude or phase over the blocks as a share, 0 where none is believed.
+    """Largest relative trend of amplitude or phase over the blocks, 0 if not significant.
 
-    A trend counts where it is larger than `tolerance` and than chance makes it.
+    A trend counts if it exceeds `tolerance` and is statistically significant.
     """
     _, series = _joined(blocks.time, _relative(blocks)[:, 0, :])
     n = series.shape[1]
@@ -117,24 +117,24 @@ def moves(blocks: BlockPhasors, tolerance: float) -> float:
     mean = series.mean(axis=1)
     fraction = series / mean[:, None] - 1
     parts = np.stack([fraction.real, fraction.imag])  # of amplitude and phase
-    place = (np.arange(n) - (n - 1) / 2) / n
-    slope = parts @ place / (place @ place)
-    rest = parts - parts.mean(axis=2, keepdims=True) - slope[:, :, None] * place
-    noise = np.sqrt(np.sum(rest**2, axis=2) / (n - 2) / (place @ place))
-    believed = (np.abs(slope) > _student_quantile(_CHANCE / 2, n - 2) * noise) & (
+    position = (np.arange(n) - (n - 1) / 2) / n
+    slope = parts @ position / (position @ position)
+    rest = parts - parts.mean(axis=2, keepdims=True) - slope[:, :, None] * position
+    noise = np.sqrt(np.sum(rest**2, axis=2) / (n - 2) / (position @ position))
+    significant = (np.abs(slope) > _student_quantile(_CHANCE / 2, n - 2) * noise) & (
         np.abs(slope) > tolerance
     )
-    return float(np.max(np.where(believed, np.abs(slope), 0.0)))
+    return float(np.max(np.where(significant, np.abs(slope), 0.0)))
 
 
 def mean_phasors(blocks: BlockPhasors) -> Means:
-    """Means over the blocks; 1σ is the larger of white noise's and of the scatter of blocks."""
-    turned = _relative(blocks)
-    mean = turned.mean(axis=2)
-    count = turned.shape[2]
+    """Means over the blocks; 1σ is the larger of white noise and scatter of blocks."""
+    relative = _relative(blocks)
+    mean = relative.mean(axis=2)
+    count = relative.shape[2]
     white = blocks.noise.mean(axis=1)[:, None] * blocks.unit_variance / count  # complex
     batches = min(_BATCHES, count)
-    parts = np.array_split(turned, batches, axis=2)
+    parts = np.array_split(relative, batches, axis=2)
     series = np.stack([part.mean(axis=2) for part in parts], axis=2)
     scatter = series - mean[:, :, None]
     across = np.sum(np.abs(scatter) ** 2, axis=2) / max(batches - 1, 1) / batches
@@ -178,7 +178,7 @@ def _joined(times: np.ndarray, series: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 class _Grid(NamedTuple):
-    """Decay times (s) and beats (rad/s) that are tried, and their spacing."""
+    """Trial decay times (s) and beat frequencies (rad/s), and their spacing."""
 
     decay: Float[np.ndarray, " point"]
     beat: Float[np.ndarray, " point"]
@@ -187,9 +187,9 @@ class _Grid(NamedTuple):
 
     def around(self, best: int) -> "_Grid":
         """A finer grid about one of the points."""
-        turns = np.linspace(-1, 1, 5)
+        offsets = np.linspace(-1, 1, 5)
         points = np.meshgrid(
-            self.decay[best] * self.ratio**turns, self.beat[best] + self.step * turns
+            self.decay[best] * self.ratio**offsets, self.beat[best] + self.step * offsets
         )
         return _Grid(points[0].ravel(), points[1].ravel(), self.ratio**0.5, self.step / 2)
 
@@ -207,7 +207,7 @@ def _grid(span: float, count: int) -> _Grid:
 def _explained(
     rest: np.ndarray, away: np.ndarray, decay: np.ndarray, beat: np.ndarray, *_: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What each transient explains of the squares of `rest`, and its amplitude by channel."""
+    """Sum of squares of `rest` explained by each transient, and its amplitude by channel."""
     shape = np.exp(-np.outer(1 / decay, away) + 1j * np.outer(beat, away))
     centred = shape - shape.mean(axis=1, keepdims=True)
     power = np.sum(np.abs(centred) ** 2, axis=1)
@@ -223,7 +223,7 @@ def _std_of_mean(values: np.ndarray) -> np.ndarray:
 
 
 def _student(batches: int) -> float:
-    """How much wider Student's 95 % interval is than the normal one, where batches are few."""
+    """Ratio of Student's 95 % interval to the normal one, for few batches."""
     if batches < 2 or batches >= _FEW_BATCHES:
         return 1.0
     return _student_quantile(0.025, batches - 1) / 1.959963984540054

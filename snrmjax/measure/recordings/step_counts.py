@@ -1,4 +1,4 @@
-"""How many steps of a stepped sine became steady states, and why the others did not."""
+"""Numbers of used and omitted steps of a stepped sine, with reasons."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -8,7 +8,7 @@ from snrmjax.numerics.facts import Fact
 
 
 class StepCounts(NamedTuple):
-    """Steps that were used, and those left out by their reason."""
+    """Number of used steps, and of omitted ones by reason."""
 
     used: int
     left_out: Mapping[str, int]
@@ -20,12 +20,12 @@ class StepCounts(NamedTuple):
 
     @property
     def reasons(self) -> tuple[tuple[str, int], ...]:
-        """Reasons for which any step was left out, with their numbers."""
+        """Reasons for omitting steps, with their numbers."""
         return tuple((reason, count) for reason, count in self.left_out.items() if count)
 
 
 def joined_counts(counts: Iterable[StepCounts]) -> StepCounts:
-    """The counts of several records together."""
+    """The sum of the counts of several records."""
     records = list(counts)
     left: Counter[str] = Counter()
     for record in records:

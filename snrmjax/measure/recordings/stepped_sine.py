@@ -1,4 +1,4 @@
-"""Steady states of a stepped sine from its time record."""
+"""Steady states from the time record of a stepped sine."""
 
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
@@ -33,24 +33,24 @@ from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
 
 _FEWEST_CYCLES = 10
-_HIGHEST = 3  # harmonics that are always fitted, so that they do not pass for noise
-_NEAR_TABLE = 0.5  # cycles over a step by which a table's frequency may be off
-_BEYOND = 3.0  # times the usual residual of a block: it lies across the end of a step
-_MOVES = 0.5  # of the way to the next step, within a step: a sweep in pieces
-_COVERED = 0.3  # of the time in which there is a tone, that steps cover at least
-_TRIES = 5  # starts of the part that is used
+_HIGHEST = 3  # least number of fitted harmonics, so that they do not count as noise
+_NEAR_TABLE = 0.5  # permitted error of a table's frequency, cycles over a step
+_BEYOND = 3.0  # times the median residual: the block extends beyond the step
+_MOVES = 0.5  # drift within a step over the distance to the next: a sweep in pieces
+_COVERED = 0.3  # least fraction of the time with a tone that steps cover
+_TRIES = 5  # candidate starts of the settled part
 _QUIET = 1e-3  # of the largest force: a pause
 
 
 class StepStatus(Status):
-    """Whether a step of a record became a steady state, or why it did not."""
+    """Whether a step of a record gave a steady state, or why it did not."""
 
     SETTLED = 0, "settled"
-    UNSETTLED = 1, "amplitude or phase still move at its end; dwell longer"
+    UNSETTLED = 1, "amplitude or phase still change at its end; dwell longer"
     TOO_SHORT = 2, f"fewer than {_FEWEST_CYCLES} cycles are left"
     NOT_FINITE = 3, "samples are missing or not finite"
     CLIPPED = 4, "a channel stays at its largest value: it is clipped"
-    NOT_FOUND = 5, "the force has another frequency than the table says"
+    NOT_FOUND = 5, "the frequency of the force differs from the table"
     NO_FORCE = 6, "the force is a thousandth of the largest or less: a pause"
 
 
@@ -62,17 +62,17 @@ class SteppedSineStates(AbstractResult):
     states: SteadyStates
     start: Float[np.ndarray, " step"] = quantity("step", "s", "its start", name="start_s")
     stop: Float[np.ndarray, " step"] = quantity("step", "s", "its end", name="stop_s")
-    # NaN where it did not settle.
+    # NaN if it did not settle.
     settled_from: Float[np.ndarray, " step"] = quantity(
-        "step", "s", "from where on it was used", name="settled_from_s"
+        "step", "s", "start of the part used", name="settled_from_s"
     )
     frequency: Float[np.ndarray, " step"] = quantity("step", "Hz", "frequency of the force")
     force: Float[np.ndarray, " step"] = quantity("step", "N or V", "amplitude of the force")
-    # NaN where none was seen.
+    # NaN if no transient was detected.
     decay_time: Float[np.ndarray, " step"] = quantity(
         "step", "s", "decay time of the transient", name="decay_time_s"
     )
-    moved: Float[np.ndarray, " step"] = quantity("step", "1", "share that a phasor still moves")
+    moved: Float[np.ndarray, " step"] = quantity("step", "1", "relative drift of a phasor")
     noise_to_white_ratio: Float[np.ndarray, " step"] = quantity(
         "step", "1", "scatter of blocks over white noise's"
     )
@@ -82,7 +82,7 @@ class SteppedSineStates(AbstractResult):
 
     @property
     def counts(self) -> StepCounts:
-        """How many steps were used, and why the others were not."""
+        """Numbers of used steps, and of omitted ones by reason."""
         left = {
             kind.name.lower().replace("_", " "): int(np.sum(self.status == int(kind)))
             for kind in StepStatus
@@ -92,14 +92,14 @@ class SteppedSineStates(AbstractResult):
 
 
 class _Measured(NamedTuple):
-    """One step with all that is known of it."""
+    """The evaluation of one step."""
 
     step: Step
     status: StepStatus
     settled_from: float = np.nan
     decay_time: float = np.nan
     moved: float = np.nan
-    left: Float[np.ndarray, " channel"] | None = None
+    transient: Float[np.ndarray, " channel"] | None = None
     means: Means | None = None
     middle: float = np.nan  # s, of the part used
     drive: float = np.nan  # amplitude of the drive's channel
@@ -123,27 +123,27 @@ def stepped_sine_states(
 ) -> SteppedSineStates:
     """Steady states from the time record of a stepped sine.
 
-    Steps of frequency or amplitude are recognised by phase and amplitude of the drive; in each the
-    transient is left out, and harmonics are fitted by least squares to what is left.
+    Steps of frequency or amplitude are detected from phase and amplitude of the drive; in each the
+    transient is discarded, and harmonics are fitted by least squares to the rest.
 
-    Arguments: `force` names the channel of the force (N), or of a voltage that stands for it (the
-    states then have `drive` in place of `force`); `responses` the channels of motion, turned into
+    Arguments: `force` names the channel of the force (N), or of a voltage in its place (the
+    states then have `drive` in place of `force`); `responses` the channels of motion, converted to
     velocities by iΩ; `level` as in `number_levels`; `sensors` names the responses in the states;
     `frequencies` is a table of steps, (start in s, end in s, frequency in rad/s), in place of
-    recognition; `settle` in s is left out of every step instead of what the transient asks for;
-    `drive` names the channel by whose tone steps are recognised and levels grouped, best the
-    voltage of the generator; `tolerance` is the share by which a phasor may still move over the
-    part that is used; `least_amplitude_step` as a share and `least_frequency_step` in rad/s are
-    the smallest steps that there are; `is_base` says that `force` names the motion of a base, whose
-    acceleration (m/s²) then takes the place of the force.
+    detection; `settle` in s is discarded at the start of every step instead of the detected
+    transient; `drive` names the channel for the detection of steps and levels, best the voltage of
+    the generator; `tolerance` is the largest relative drift of a phasor over the part used;
+    `least_amplitude_step` (relative) and `least_frequency_step` in rad/s are the smallest steps of
+    the test; with `is_base`, `force` names the motion of a base, whose acceleration (m/s²) then
+    takes the place of the force.
     Returns `SteppedSineStates`: `states` in the order of time, with standard deviations (the
-    larger of that of white noise and of the scatter of blocks), harmonics and `order`; and the
-    table of steps, with those left out and why.
-    Raises `ValueError` for channels that do not fit, a record without steps or with one only
-    (state `frequencies` for a single tone), a table beyond the record, fewer than four samples a
-    cycle, harmonics above half the sampling rate, and a record none of whose steps settled.
-    Validity: 1σ holds for noise, also coloured, whose memory is short against a sixteenth of the
-    settled part; a dwell of ten cycles at least, of twenty where steps are to be recognised.
+    larger of those from white noise and from the scatter of blocks), harmonics and `order`; and
+    the table of steps, with the reasons of omitted ones.
+    Raises `ValueError` for unsuitable channels, a record without steps or with a single one
+    (state `frequencies` for a single tone), a table beyond the record, fewer than four samples per
+    cycle, harmonics above half the sampling rate, and a record without any settled step.
+    Validity: 1σ is valid for white or coloured noise with a correlation time well below a sixteenth
+    of the settled part; dwells of at least ten cycles, twenty for the detection of steps.
 
     >>> from snrmjax.measure import Channel, time_recording
     >>> t = np.arange(4000) / 1000
@@ -193,7 +193,7 @@ def _recognised(
     long = [step for step in steps if _cycles(recording, step) >= _FEWEST_CYCLES]
     if sum(step.stop - step.start for step in long) < _COVERED * np.ptp(track.middle):
         raise ValueError(
-            f"the record has no steps: the tone of channel {name} does not stay at one frequency "
+            f"the record has no steps: the tone of channel {name} does not dwell at one frequency "
             f"for {_FEWEST_CYCLES} cycles anywhere (a sweep? `sweep_states` reads it)."
         )
     if len(long) == 1:
@@ -205,7 +205,7 @@ def _recognised(
     moves = moves_within_steps(long, track, recording.sampling_rate)
     if moves > _MOVES:
         raise ValueError(
-            f"the record has no steps: the tone of channel {name} moves on within them, by "
+            f"the record has no steps: the frequency of channel {name} drifts within them, by "
             f"{100 * moves:.0f} % of the way to the next (a sweep? `sweep_states` reads it)."
         )
     return steps
@@ -226,7 +226,7 @@ def _of_table(
     for k, (start, stop, omega) in enumerate(table):
         if not (np.isfinite([start, stop, omega]).all() and start < stop and omega > 0):
             raise ValueError(
-                f"row {k} of `frequencies` must rise from start to end with a frequency above 0, "
+                f"row {k} of `frequencies` must have start < end and a frequency above 0, "
                 f"but is {start:g} s, {stop:g} s, {omega:g} rad/s."
             )
         if start < begin - slack or stop > end + slack:
@@ -264,7 +264,7 @@ def _measure(
     tolerance: float,
     of_table: bool,
 ) -> _Measured:
-    """Fits one step."""
+    """Evaluate one step."""
     if settle is not None and not 0 <= settle < np.inf:
         raise ValueError(f"`settle` must be a time of 0 s or more, but is {settle:g}.")
     if _cycles(recording, step) < _FEWEST_CYCLES:
@@ -283,11 +283,11 @@ def _measure(
     dwell = (step.stop - step.start) / recording.sampling_rate
     if of_table and abs(shift) * dwell > HERTZ * _NEAR_TABLE:
         return _Measured(step, StepStatus.NOT_FOUND)
-    blocks = blocks.turned(shift)
+    blocks = blocks.shifted(shift)
     step = step._replace(frequency=blocks.frequency)
     motion = _without_drive(blocks, chosen)
     part = settled_part(motion, settle)
-    # What one decaying mode does not explain still moves: then later, as far as there is time.
+    # If a single decaying mode does not explain the drift, a later start is tried.
     for first in np.unique(np.linspace(part.first, part.latest, _TRIES).astype(int)):
         kept = _rows(motion, slice(first, None))
         moved = moves(kept, tolerance) if len(kept.time) else 0.0
@@ -297,8 +297,8 @@ def _measure(
     if len(kept.time) * each * step.frequency < HERTZ * _FEWEST_CYCLES / 2 or len(kept.time) < 3:
         return _Measured(step, StepStatus.TOO_SHORT)
     means = mean_phasors(kept)
-    left = part.left[:, first]
-    fraction = float(np.max(left / np.abs(means.phasors[:, 0])))
+    transient = part.remaining[:, first]
+    fraction = float(np.max(transient / np.abs(means.phasors[:, 0])))
     begins = float(kept.time[0] - each / 2)
     unsettled = moved > 0 or fraction > tolerance
     return _Measured(
@@ -307,7 +307,7 @@ def _measure(
         np.nan if unsettled else begins,
         part.decay_time,
         max(moved, fraction),
-        left,
+        transient,
         means,
         float(kept.time.mean()),
         float(np.abs(blocks.phasors[guide, 0, first:]).mean()) if chosen.drive else np.nan,
@@ -320,7 +320,7 @@ def _without_drive(blocks: BlockPhasors, chosen: ChosenChannels) -> BlockPhasors
 
 
 def _within_step(blocks: BlockPhasors, guide: int) -> BlockPhasors:
-    """Without blocks at the ends in which the drive is no steady tone: the step is over there."""
+    """Without blocks at the ends that extend beyond the step, where the drive is not steady."""
     rest = blocks.noise[guide]
     good = np.flatnonzero(rest <= _BEYOND * np.median(rest))
     return _rows(blocks, slice(int(good[0]), int(good[-1]) + 1))
@@ -336,8 +336,8 @@ def _rows(blocks: BlockPhasors, rows: slice) -> BlockPhasors:
 
 
 def _without_pauses(measured: list[_Measured]) -> list[_Measured]:
-    sizes = [fitted.step.amplitude for fitted in measured]
-    largest = max((size for size in sizes if np.isfinite(size)), default=0.0)
+    amplitudes = [fitted.step.amplitude for fitted in measured]
+    largest = max((a for a in amplitudes if np.isfinite(a)), default=0.0)
     return [
         fitted._replace(status=StepStatus.NO_FORCE, settled_from=np.nan)
         if fitted.means is not None and fitted.step.amplitude <= _QUIET * largest
@@ -389,12 +389,12 @@ def _result(
 
 
 def _table(good: list[_Measured]) -> PhasorTable:
-    """Phasors of the settled steps; what may be left of a transient is added to the errors."""
+    """Phasors of the settled steps; the remaining transient is added to the errors."""
     means = [fitted.means for fitted in good if fitted.means is not None]
-    left = np.array([fitted.left for fitted in good])
+    transient = np.array([fitted.transient for fitted in good])
     first = np.array([np.abs(fitted.phasors[:, 0]) for fitted in means])
-    amplitude_std = np.hypot([fitted.amplitude_std for fitted in means], left)
-    phase_std = np.hypot([fitted.phase_std for fitted in means], (left / first)[:, :])
+    amplitude_std = np.hypot([fitted.amplitude_std for fitted in means], transient)
+    phase_std = np.hypot([fitted.phase_std for fitted in means], (transient / first)[:, :])
     drive = np.array([fitted.drive for fitted in good])
     return PhasorTable(
         np.array([fitted.middle for fitted in good]),

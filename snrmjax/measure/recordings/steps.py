@@ -1,9 +1,9 @@
-"""Steps of a stepped sine: stretches of one frequency and one amplitude of the drive.
+"""Steps of a stepped sine: stretches of constant frequency and amplitude of the drive.
 
-The phase of a steady tone is a straight line in time. The track of the drive is cut where straight
-lines of phase and constants of log amplitude, each cut at a price, fit best (optimal partitioning
-with pruning), and pieces that differ by less than a step are joined again: the force of a shaker
-still moves while the structure settles. A jump of phase or a continuous phase makes no difference.
+The phase of a steady tone is linear in time. The track of the drive is partitioned into linear
+phase and constant log amplitude, with a penalty per change point (optimal partitioning with
+pruning), and pieces that differ by less than a step are merged: the force of a shaker still changes
+while the structure settles. The phase may jump or be continuous between steps.
 
 Reference: R. Killick, P. Fearnhead & I. A. Eckley, J. Am. Stat. Assoc. 107 (2012) 1590,
 doi:10.1080/01621459.2012.737745.
@@ -17,17 +17,17 @@ import numpy as np
 
 from snrmjax.measure.recordings.tone_track import ToneTrack, unwrapped_phase
 
-_PRICE = 25.0  # of a cut, in squared standard deviations
-_PHASE_FLOOR = 0.01  # rad: what moves less has not moved
+_PENALTY = 25.0  # of a change point, in squared standard deviations
+_PHASE_FLOOR = 0.01  # rad: smaller changes are ignored
 _AMPLITUDE_FLOOR = 0.01  # of the amplitude
-_AT_ONCE = 1500  # frames
+_AT_ONCE = 1500  # frames per partitioning
 _FEWEST_FRAMES = 3
-_GAP = 1.6  # hops between frames, above which something was missing
-_SAME_PHASE = 0.01  # cycles over the shorter of two pieces that are one step
-_CONTINUOUS = 0.25  # rad, largest jump of phase within a step
-_NEAR = 4  # frames at an end that say how the amplitude moves there
-_AROUND = 41  # frames whose scatter is taken together
-_NORMAL = 0.6745
+_GAP = 1.6  # hops between frames, above which data are missing
+_SAME_PHASE = 0.01  # largest phase drift between pieces of one step, cycles over the shorter one
+_CONTINUOUS = 0.25  # rad, largest phase jump within a step
+_NEAR = 4  # frames at an end, for the trend of the amplitude
+_AROUND = 41  # frames of a running median of the scatter
+_NORMAL = 0.6745  # median of |x| over σ of a normal distribution
 
 
 class Step(NamedTuple):
@@ -36,12 +36,12 @@ class Step(NamedTuple):
     start: int  # sample
     stop: int  # sample, exclusive
     frequency: float  # rad/s
-    amplitude: float  # of the drive, SI; NaN where a table says the step
+    amplitude: float  # of the drive, SI; NaN for a step from a table
 
 
 class _Piece(NamedTuple):
     rows: slice  # of the track
-    frequency: float  # rad a sample
+    frequency: float  # rad per sample
     level: float  # log amplitude
     slope: float  # log amplitude per sample
     middle: float  # sample
@@ -54,8 +54,8 @@ def recognise_steps(
 ) -> list[Step]:
     """Steps of a track in the order of time.
 
-    Arguments: `least_amplitude_step` as a share of the amplitude; `least_step` in rad/s, the
-    smallest difference of frequency that is a step (0: whatever can be told apart).
+    Arguments: `least_amplitude_step` relative to the amplitude; `least_step` in rad/s, the
+    smallest frequency difference of a step (0: the smallest that can be resolved).
     """
     phase = unwrapped_phase(track)
     level = np.log(track.amplitude)
@@ -77,7 +77,7 @@ def recognise_steps(
             steps.append((piece, piece, piece))
     return [
         Step(
-            # The middles of frames are in the step, their ends may lie beyond it.
+            # Only the middles of frames are certain to lie in the step.
             int(np.ceil(track.middle[first.rows.start])),
             int(track.middle[last.rows.stop - 1]) + 1,
             longest.frequency * sampling_rate,
@@ -88,40 +88,39 @@ def recognise_steps(
 
 
 def moves_within_steps(steps: Sequence[Step], track: ToneTrack, sampling_rate: float) -> float:
-    """How far the frequency moves on within a step, over its distance to the next: the median.
+    """Change of frequency within a step over the distance to the next: the median.
 
-    Next to nothing for steps. A sweep passes for steps too, where straight lines of phase fit its
-    short pieces: there it is one. The move is that of a parabola of the phase, whose noise has
-    either sign.
+    About zero for steps, about one for a sweep that was partitioned into short pieces. The change
+    is that of a parabola fitted to the phase, whose noise has either sign.
     """
     phase = unwrapped_phase(track)
     moves = [0.0]
     for step, after in itertools.pairwise(steps):
         rows = slice(*np.searchsorted(track.middle, (step.start, step.stop)))
-        further = (after.frequency - step.frequency) / sampling_rate
-        if rows.stop - rows.start > 2 and further:
+        distance = (after.frequency - step.frequency) / sampling_rate
+        if rows.stop - rows.start > 2 and distance:
             away = track.middle[rows] - track.middle[rows].mean()
-            bend = 2 * np.polyfit(away, phase[rows], 2)[0]
-            moves.append(bend * (after.start + after.stop - step.start - step.stop) / 2 / further)
+            rate = 2 * np.polyfit(away, phase[rows], 2)[0]
+            moves.append(rate * (after.start + after.stop - step.start - step.stop) / 2 / distance)
     return float(np.median(moves))
 
 
 def _deviations(values: np.ndarray, middle: np.ndarray, floor: float) -> np.ndarray:
-    """1σ of values about straight lines of three neighbours, as the middle of its surroundings."""
+    """1σ of values from their second differences, as a running median."""
     from scipy.ndimage import median_filter
 
     if len(values) < 5:
         return np.full(len(values), floor)
     fraction = (middle[1:-1] - middle[:-2]) / (middle[2:] - middle[:-2])
-    bend = values[1:-1] - (1 - fraction) * values[:-2] - fraction * values[2:]
-    # Frames overlap by half: neighbours of a white noise are correlated by one sixth.
-    around = median_filter(np.abs(bend), size=_AROUND, mode="nearest")
+    roughness = values[1:-1] - (1 - fraction) * values[:-2] - fraction * values[2:]
+    # Frames overlap by half: white noise in neighbouring frames has a correlation of one sixth.
+    around = median_filter(np.abs(roughness), size=_AROUND, mode="nearest")
     middle_of = np.concatenate([around[:1], around, around[-1:]])
     return np.maximum(floor, middle_of / (_NORMAL * np.sqrt(1.5)))
 
 
 def _cuts(track: ToneTrack, phase: np.ndarray, level: np.ndarray) -> list[int]:
-    """Frames at which pieces begin, the end last."""
+    """First frames of the pieces, with the end as the last entry."""
     weight = _deviations(phase, track.middle, _PHASE_FLOOR) ** -2
     level_weight = _deviations(level, track.middle, _AMPLITUDE_FLOOR) ** -2
     hop = np.maximum(track.length[1:], track.length[:-1]) / 2
@@ -136,7 +135,7 @@ def _cuts(track: ToneTrack, phase: np.ndarray, level: np.ndarray) -> list[int]:
                 track.middle[rows], phase[rows], level[rows], weight[rows], level_weight[rows]
             )
             if stop < end:
-                # The last piece may go on: the next round begins with it, or in its middle.
+                # The last piece may continue: the next round begins with it, or in its middle.
                 starts = [k for k in starts if k < stop - start]
                 late = starts[-1] if starts[-1] > 0 else (stop - start) // 2
                 starts = [*starts[:-1], late] if starts[-1] > 0 else [0, late]
@@ -152,7 +151,7 @@ def _partition(
     weight: np.ndarray,
     level_weight: np.ndarray,
 ) -> list[int]:
-    """Starts of the pieces of least cost, the end last."""
+    """Starts of the pieces of least cost, with the end as the last entry."""
     n = len(time)
     time = (time - time.mean()) / max(float(np.ptp(time)), 1.0)
     phase = phase - np.polyval(np.polyfit(time, phase, min(1, n - 1)), time)
@@ -165,7 +164,7 @@ def _partition(
     wp, wtp, wpp = summed(weight * phase), summed(weight * time * phase), summed(weight * phase**2)
     v, vl, vll = summed(level_weight), summed(level_weight * level), summed(level_weight * level**2)
     best, before = np.full(n + 1, np.inf), np.zeros(n + 1, dtype=int)
-    best[0] = -_PRICE
+    best[0] = -_PENALTY
     open_starts = np.array([0])
     for stop in range(1, n + 1):
         k = open_starts
@@ -177,7 +176,7 @@ def _partition(
         constant = vll[stop] - vll[k] - (vl[stop] - vl[k]) ** 2 / (v[stop] - v[k])
         cost = best[k] + np.maximum(spp - line, 0.0) + np.maximum(constant, 0.0)
         least = int(np.argmin(cost))
-        best[stop], before[stop] = cost[least] + _PRICE, k[least]
+        best[stop], before[stop] = cost[least] + _PENALTY, k[least]
         open_starts = np.append(k[cost <= best[stop]], stop)
     cuts = [n]
     while cuts[-1] > 0:
@@ -189,8 +188,10 @@ def _piece(track: ToneTrack, phase: np.ndarray, level: np.ndarray, rows: slice) 
     middle = float(track.middle[rows].mean())
     away = track.middle[rows] - middle
     slope, at = np.polyfit(away, phase[rows], 1)
-    drift, size = np.polyfit(away, level[rows], 1)
-    return _Piece(rows, float(slope), float(size), float(drift), middle, float(at), np.ptp(away))
+    drift, mean_level = np.polyfit(away, level[rows], 1)
+    return _Piece(
+        rows, float(slope), float(mean_level), float(drift), middle, float(at), np.ptp(away)
+    )
 
 
 def _one_step(
@@ -201,7 +202,7 @@ def _one_step(
     least_amplitude_step: float,
     least_step: float,
 ) -> bool:
-    """Whether a piece goes on with the step before it."""
+    """Whether a piece continues the previous step."""
     _, longest, last = step
     gap = track.middle[piece.rows.start] - track.middle[last.rows.stop - 1]
     if gap > (_FEWEST_FRAMES + 1) * track.length[piece.rows.start] / 2:
@@ -228,7 +229,7 @@ def _one_step(
 
 
 def _at_end(track: ToneTrack, level: np.ndarray, last: _Piece, piece: _Piece) -> float:
-    """Jump of the log amplitude between two pieces, each carried on as it moves at that end."""
+    """Jump of the log amplitude between two pieces, each extrapolated by its trend there."""
     before = slice(max(last.rows.start, last.rows.stop - _NEAR), last.rows.stop)
     after = slice(piece.rows.start, min(piece.rows.stop, piece.rows.start + _NEAR))
     between = (track.middle[before.stop - 1] + track.middle[after.start]) / 2

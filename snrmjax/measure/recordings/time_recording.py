@@ -1,4 +1,4 @@
-"""Sampled channels of a test, in memory or read block by block from a file."""
+"""Sampled channels of a test, in memory or read in blocks from a file."""
 
 import abc
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ _MOST_AT_ONCE = 2**25  # numbers of all channels together: 256 MiB of float64
 
 
 class AbstractSamples(abc.ABC):
-    """Samples as they were recorded, before calibration, wherever they lie."""
+    """Samples as recorded, before calibration, from any storage."""
 
     @property
     @abc.abstractmethod
@@ -31,7 +31,7 @@ class AbstractSamples(abc.ABC):
         """Samples `start` to `stop` (exclusive) of some channels."""
 
 
-class HeldSamples(AbstractSamples):
+class SamplesInMemory(AbstractSamples):
     """Samples in memory (or of a memory-mapped file)."""
 
     def __init__(self, values: Num[np.ndarray, "channel sample"]) -> None:
@@ -59,10 +59,10 @@ class RecordBlock(NamedTuple):
 
 
 class TimeRecording(AbstractResult):
-    """Channels sampled together at an even rate; see `time_recording`.
+    """Simultaneously sampled channels at a constant rate; see `time_recording`.
 
-    Nothing is read before it is asked for: `values` gives a stretch in SI units, `blocks` all of
-    it piece by piece, so that a record need not fit into memory.
+    Reading is lazy: `values` gives a stretch in SI units, `blocks` the whole record in pieces, so
+    that it need not fit into memory.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("time_s",)
@@ -81,7 +81,7 @@ class TimeRecording(AbstractResult):
 
     @property
     def duration(self) -> float:
-        """From the first sample to one step after the last, s."""
+        """Duration from the first sample to one step after the last, s."""
         return self.n_samples / self.sampling_rate
 
     @property
@@ -99,15 +99,14 @@ class TimeRecording(AbstractResult):
     ) -> Float[np.ndarray, "channel sample"]:
         """Samples `start` to `stop` of the named channels (all by default) in SI units.
 
-        Raises `ValueError` for a name that no channel has, and for more than 256 MiB at once:
-        take `blocks`.
+        Raises `ValueError` for an unknown name, and for more than 256 MiB at once: use `blocks`.
         """
         chosen = self.channel_names if names is None else tuple(names)
         rows = [channel_number(self.channels, name) for name in chosen]
         last = self.n_samples if stop is None else min(stop, self.n_samples)
         if len(rows) * max(0, last - start) > _MOST_AT_ONCE:
             raise ValueError(
-                f"{len(rows)} channels of {last - start} samples are too many to hold at once: "
+                f"{len(rows)} channels of {last - start} samples are too many for memory: "
                 "read them by blocks."
             )
         scale = np.array([self.channels[k].calibration for k in rows])
@@ -116,9 +115,9 @@ class TimeRecording(AbstractResult):
     def blocks(
         self, length: int, names: Sequence[str] | None = None, *, overlap: int = 0
     ) -> Iterator[RecordBlock]:
-        """The recording in stretches of `length` samples, each with `overlap` of the one before.
+        """The recording in blocks of `length` samples, each overlapping the previous by `overlap`.
 
-        The last may be shorter. Raises `ValueError` for an overlap that is not shorter.
+        The last may be shorter. Raises `ValueError` for an overlap that is not below `length`.
         """
         if not 0 <= overlap < length:
             raise ValueError(f"`overlap` must be from 0 to below {length}, but is {overlap}.")
@@ -157,35 +156,37 @@ def time_recording(
     name: str = "",
     notes: Sequence[Fact | str] = (),
 ) -> TimeRecording:
-    """Channels sampled together, checked.
+    """Build a `TimeRecording`, with checks.
 
-    Arguments: `samples` as recorded, before calibration, an array (kept as it is, memory-mapped or
-    not) or what reads them; `sampling_rate` in Hz; `start_time` in s.
-    Raises `ValueError` for sizes that disagree, no samples, channels as in `checked_channels`, and
+    Arguments: `samples` as recorded, before calibration, an array (not copied, possibly
+    memory-mapped) or a reader; `sampling_rate` in Hz; `start_time` in s.
+    Raises `ValueError` for inconsistent shapes, no samples, channels as in `checked_channels`, and
     a rate that is not positive and finite.
 
     >>> record = time_recording(np.ones((1, 4)), [Channel("CH1", "force", "kN", 1e3)], 2.0)
     >>> record.values(["CH1"]).tolist(), record.time().tolist()
     ([[1000.0, 1000.0, 1000.0, 1000.0]], [0.0, 0.5, 1.0, 1.5])
     """
-    held = samples if isinstance(samples, AbstractSamples) else _held(samples)
+    stored = samples if isinstance(samples, AbstractSamples) else _in_memory(samples)
     listed = checked_channels(channels)
-    if held.shape[0] != len(listed):
+    if stored.shape[0] != len(listed):
         raise ValueError(
-            f"`samples` must have one row a channel, {len(listed)}, but has {held.shape[0]}."
+            f"`samples` must have one row per channel, {len(listed)}, but has {stored.shape[0]}."
         )
-    if not held.shape[1]:
+    if not stored.shape[1]:
         raise ValueError("a recording needs samples, but has none.")
     require("`sampling_rate` (Hz)", sampling_rate, POSITIVE)
     require("`start_time` (s)", start_time)
-    return TimeRecording(listed, held, float(sampling_rate), float(start_time), name, tuple(notes))
+    return TimeRecording(
+        listed, stored, float(sampling_rate), float(start_time), name, tuple(notes)
+    )
 
 
-def _held(samples: Num[np.ndarray, "channel sample"]) -> HeldSamples:
+def _in_memory(samples: Num[np.ndarray, "channel sample"]) -> SamplesInMemory:
     values = np.asanyarray(samples)
     if values.ndim != 2 or values.dtype.kind not in "iuf":
         raise ValueError(
             "`samples` must be real numbers of channels by samples, but have shape "
             f"{values.shape} and type {values.dtype}."
         )
-    return HeldSamples(values)
+    return SamplesInMemory(values)

@@ -1,9 +1,9 @@
-"""A tone followed through a record: frequency, amplitude and phase frame by frame.
+"""A tone tracked through a record: frequency, amplitude and phase of every frame.
 
-Frames are a power of two of samples and hold three to six cycles, so that they shorten as the
-frequency rises. Each is weighted by Hann's window; its frequency comes from the ratio of
-neighbouring bins, its phase from the largest bin, whose phase in the middle of a symmetric window
-is that of the tone. Reference: T. Grandke, IEEE Trans. Instrum. Meas. 32 (1983) 350.
+Frames have a power of two of samples and three to six cycles, so that they shorten with rising
+frequency. Each is weighted by a Hann window; its frequency follows from the ratio of neighbouring
+bins, its phase from the largest bin, whose phase in the middle of a symmetric window is that of
+the tone. Reference: T. Grandke, IEEE Trans. Instrum. Meas. 32 (1983) 350.
 """
 
 from collections.abc import Iterator
@@ -15,21 +15,21 @@ from jaxtyping import Float, Int
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.units import HERTZ
 
-_BLOCK = 2**18  # samples read at once
-_SHORTEST, _LONGEST = 4, 16  # powers of two of a frame
-_CYCLES = (3, 6)  # of a frame, from and to
+_BLOCK = 2**18  # samples per block
+_SHORTEST, _LONGEST = 4, 16  # log2 of the samples of a frame
+_CYCLES = (3, 6)  # per frame, from and to
 _BINS = 9
-_FRACTION = 0.01  # of a block's power, for an octave to be looked at
-_TONE = 0.5  # least share of a frame's power that is the tone's
-_FEWEST_SAMPLES = 4  # a cycle
+_FRACTION = 0.01  # of a block's power, for an octave to be evaluated
+_TONE = 0.5  # least fraction of a frame's power in the tone
+_FEWEST_SAMPLES = 4  # per cycle
 
 
 class ToneTrack(NamedTuple):
-    """Frames in the order of time that hold a tone; others are left out."""
+    """The frames that contain a tone, in the order of time."""
 
     middle: Float[np.ndarray, " frame"]  # samples
     length: Int[np.ndarray, " frame"]  # samples
-    frequency: Float[np.ndarray, " frame"]  # rad a sample
+    frequency: Float[np.ndarray, " frame"]  # rad per sample
     phase: Float[np.ndarray, " frame"]  # rad in the middle, cosine
     amplitude: Float[np.ndarray, " frame"]  # SI
 
@@ -39,33 +39,33 @@ class ToneTrack(NamedTuple):
 
 
 def track_tone(recording: TimeRecording, name: str) -> ToneTrack:
-    """Follows the strongest tone of a channel, block by block.
+    """Track the strongest tone of a channel, in blocks.
 
-    Raises `ValueError` where no frame holds a tone, and for fewer than four samples a cycle.
+    Raises `ValueError` if no frame contains a tone with four samples per cycle or more.
     """
     pieces = list(_blocks(recording, name))
     columns = [np.concatenate(part) for part in zip(*pieces, strict=True)]
     if not columns[0].size:
         raise ValueError(
-            f"channel {name} holds no tone: in no stretch of {_CYCLES[0]} to {_CYCLES[1]} cycles "
-            f"is one frequency half of its power, with {_FEWEST_SAMPLES} samples a cycle or more."
+            f"channel {name} has no tone: in no stretch of {_CYCLES[0]} to {_CYCLES[1]} cycles has "
+            f"one frequency half of the power, with {_FEWEST_SAMPLES} samples per cycle or more."
         )
     return ToneTrack._make(columns)
 
 
 def unwrapped_phase(track: ToneTrack) -> Float[np.ndarray, " frame"]:
-    """Phase in rad that goes on from frame to frame as the frequencies of both say."""
-    turned = np.diff(track.middle) * (track.frequency[1:] + track.frequency[:-1]) / 2
-    rest = np.angle(np.exp(1j * (np.diff(track.phase) - turned)))
-    return track.phase[0] + np.concatenate([[0.0], np.cumsum(turned + rest)])
+    """Phase in rad, unwrapped from frame to frame by their mean frequency."""
+    advance = np.diff(track.middle) * (track.frequency[1:] + track.frequency[:-1]) / 2
+    rest = np.angle(np.exp(1j * (np.diff(track.phase) - advance)))
+    return track.phase[0] + np.concatenate([[0.0], np.cumsum(advance + rest)])
 
 
 def check_rate(recording: TimeRecording, frequency: float, name: str) -> None:
-    """Raises `ValueError` for a frequency (rad/s) with fewer than four samples a cycle."""
+    """Raises `ValueError` for a frequency (rad/s) with fewer than four samples per cycle."""
     samples = 2 * np.pi * recording.sampling_rate / frequency
     if samples < _FEWEST_SAMPLES * (1 - 1e-9):
         raise ValueError(
-            f"a record needs {_FEWEST_SAMPLES} samples a cycle, but channel {name} has "
+            f"a record needs {_FEWEST_SAMPLES} samples per cycle, but channel {name} has "
             f"{samples:.3g} at {frequency / HERTZ:.6g} Hz, sampled at "
             f"{recording.sampling_rate:.6g} Hz."
         )
@@ -100,10 +100,10 @@ def _of_block(values: np.ndarray, start: int, new: int) -> ToneTrack:
 
 
 def _octaves(values: np.ndarray) -> list[int]:
-    """Powers of two of the frames for the octaves in which there is something."""
+    """log2 of the frame lengths for the octaves with significant power."""
     kept = np.where(np.isfinite(values), values, 0.0)
     spectrum = np.abs(np.fft.rfft(kept - kept.mean())) ** 2
-    per_sample = np.arange(len(spectrum)) / len(values)  # cycles a sample
+    per_sample = np.arange(len(spectrum)) / len(values)  # cycles per sample
     powers = []
     total = spectrum.sum()
     if total == 0:
@@ -117,11 +117,11 @@ def _octaves(values: np.ndarray) -> list[int]:
 
 
 def _frames(windows: np.ndarray, start: int, size: int) -> ToneTrack:
-    """The frames of one length that hold a tone of three to six cycles."""
+    """The frames of one length that contain a tone of three to six cycles."""
     away = np.arange(size) - (size - 1) / 2
     window = 0.5 + 0.5 * np.cos(2 * np.pi * away / size)
-    turn = np.exp(-2j * np.pi * np.outer(away, np.arange(_BINS)) / size)
-    weights = window[:, None] * turn
+    kernel = np.exp(-2j * np.pi * np.outer(away, np.arange(_BINS)) / size)
+    weights = window[:, None] * kernel
     basis = np.concatenate([weights.real, weights.imag[:, 1:]], axis=1)
     mean = windows.mean(axis=1, keepdims=True)
     centred = windows - mean
@@ -129,11 +129,11 @@ def _frames(windows: np.ndarray, start: int, size: int) -> ToneTrack:
     bins = projected[:, :_BINS].astype(complex)
     bins[:, 1:] += 1j * projected[:, _BINS:]
     energy = np.einsum("fs,fs,s->f", centred, centred, window**2)
-    sizes = np.abs(bins)
-    largest = np.where(np.isfinite(sizes).all(axis=1), sizes.T, 0.0).T.argmax(axis=1)
+    magnitudes = np.abs(bins)
+    largest = np.where(np.isfinite(magnitudes).all(axis=1), magnitudes.T, 0.0).T.argmax(axis=1)
     usable = (largest >= 1) & (largest < _BINS - 1) & np.isfinite(energy) & (energy > 0)
     rows, peak = np.flatnonzero(usable), largest[usable]
-    left, at, right = (sizes[rows, peak + k] for k in (-1, 0, 1))
+    left, at, right = (magnitudes[rows, peak + k] for k in (-1, 0, 1))
     ratio = np.maximum(left, right) / at
     shift = np.clip(np.where(right >= left, 1, -1) * (2 * ratio - 1) / (1 + ratio), -0.6, 0.6)
     amplitude = 2 * at * (1 - shift**2) / np.sinc(shift) / (size / 2)
@@ -153,13 +153,13 @@ def _frames(windows: np.ndarray, start: int, size: int) -> ToneTrack:
 
 
 def _shortest_first(tracks: list[ToneTrack]) -> ToneTrack:
-    """Frames of all lengths by time; a longer frame that a shorter one covers is left out."""
+    """Frames of all lengths by time; longer frames covered by a shorter one are omitted."""
     kept = tracks[0]
     for longer in tracks[1:]:
         if kept.middle.size and longer.middle.size:
-            place = np.searchsorted(kept.middle, longer.middle)
-            before = np.abs(longer.middle - kept.middle[np.maximum(place - 1, 0)])
-            after = np.abs(longer.middle - kept.middle[np.minimum(place, kept.middle.size - 1)])
+            index = np.searchsorted(kept.middle, longer.middle)
+            before = np.abs(longer.middle - kept.middle[np.maximum(index - 1, 0)])
+            after = np.abs(longer.middle - kept.middle[np.minimum(index, kept.middle.size - 1)])
             longer = longer.part(np.minimum(before, after) > longer.length / 2)
         joined = [np.concatenate(pair) for pair in zip(kept, longer, strict=True)]
         order = np.argsort(joined[0], kind="stable")

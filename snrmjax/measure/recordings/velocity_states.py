@@ -1,4 +1,4 @@
-"""From phasors of recorded channels to steady states: which channels, velocities, levels."""
+"""From phasors of recorded channels to steady states: channels, velocities, levels."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from snrmjax.numerics.facts import Fact
 
 Levels = Literal["auto", "force", "drive", "runs"]
 
-_GAP = 0.05  # of log amplitude between levels, at least
-_SPREAD = 0.4  # of log amplitude within a level, at most, where groups are to be believed
+_GAP = 0.05  # least gap of log amplitude between levels
+_SPREAD = 0.4  # largest spread of log amplitude within a level, for plausible groups
 
 
 class PhasorTable(NamedTuple):
-    """Phasors of all states, relative to the force, before they are velocities."""
+    """Phasors of all states relative to the force, before conversion to velocities."""
 
-    time: Float[np.ndarray, " state"]  # s, middle of what was used
+    time: Float[np.ndarray, " state"]  # s, middle of the part used
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N or V
     force_std: Float[np.ndarray, " state"]
@@ -31,11 +31,13 @@ class PhasorTable(NamedTuple):
     amplitude_std: Float[np.ndarray, "state channel"]  # SI
     phase_std: Float[np.ndarray, "state channel"]  # rad
     harmonic_std: Float[np.ndarray, "state channel order"]  # SI, rms of a complex error
-    drive: Float[np.ndarray, " state"] | None = None  # V, of another channel, to group levels
+    drive: Float[np.ndarray, " state"] | None = (
+        None  # V, of another channel, for grouping into levels
+    )
 
 
 class ChosenChannels(NamedTuple):
-    """Channels of a record in the order in which they are read: force, responses, drive."""
+    """Channels of a record in reading order: force, responses, drive."""
 
     names: tuple[str, ...]
     force: Channel
@@ -53,14 +55,14 @@ def choose_channels(
     drive: str | None = None,
     is_base: bool = False,
 ) -> ChosenChannels:
-    """The channels of a verb, checked; `is_base`: what stands for the force is a base's motion.
+    """The checked channels; with `is_base` the motion of a base takes the place of the force.
 
-    Raises `ValueError` for names that no channel has, doubled ones, a force that is no force or
-    voltage, responses that are no motion, and sensors of another number.
+    Raises `ValueError` for unknown and repeated names, a force that is not a force or voltage,
+    responses that are not a motion, and a wrong number of sensors.
     """
     wanted = (responses,) if isinstance(responses, str) else tuple(responses)
     if not wanted:
-        raise ValueError("`responses` must name one channel at least, but is empty.")
+        raise ValueError("`responses` must name at least one channel, but is empty.")
     source = recording.channels[_number(recording, force, "force")]
     if is_base and source.quantity not in DERIVATIVE:
         raise ValueError(
@@ -96,14 +98,14 @@ def choose_channels(
 def velocity_factors(
     channels: Sequence[Channel], orders: Sequence[int], frequency: Float[np.ndarray, "*batch"]
 ) -> Complex[np.ndarray, "*batch channel order"]:
-    """What turns phasors of each channel into velocities: (ikΩ) for displacements, 1/(ikΩ) for
-    accelerations. The mean of an acceleration says nothing of the velocity: NaN.
+    """Factors from phasors of each channel to velocities: (ikΩ) for displacements, 1/(ikΩ) for
+    accelerations. NaN for the mean of an acceleration, which does not determine the velocity.
     """
     power = 1 - np.array([DERIVATIVE[channel.quantity] for channel in channels])[:, None]
-    turn = 1j * np.asarray(orders) * np.asarray(frequency, dtype=float)[..., None, None]
-    safe = np.where(turn == 0, 1.0, turn)
+    derivative = 1j * np.asarray(orders) * np.asarray(frequency, dtype=float)[..., None, None]
+    safe = np.where(derivative == 0, 1.0, derivative)
     at_rest = np.where(power == 0, 1.0, np.where(power > 0, 0.0, np.nan))
-    return np.where(turn == 0, at_rest, safe**power)
+    return np.where(derivative == 0, at_rest, safe**power)
 
 
 def states_of_phasors(
@@ -114,17 +116,17 @@ def states_of_phasors(
     level: Levels | int,
     notes: Sequence[Fact] = (),
 ) -> SteadyStates:
-    """Steady states of phasors of any motion, in the order of the table.
+    """Steady states from phasors of any motion, in the order of the table.
 
-    Of a base whatever was recorded becomes its acceleration, from which phases then count.
+    For base excitation any recorded motion is converted to acceleration, the phase reference.
     """
     higher = tuple(k for k in orders if k != 1)
     phasors = np.concatenate([table.mean[:, :, None], table.phasors], axis=2)
     base = chosen.force.quantity in DERIVATIVE
     if base:
         lead = (1j * table.frequency) ** (2 - DERIVATIVE[chosen.force.quantity])
-        turns = np.exp(-1j * np.angle(lead)[:, None] * np.arange(phasors.shape[2]))
-        phasors = phasors * turns[:, None, :]
+        rotation = np.exp(-1j * np.angle(lead)[:, None] * np.arange(phasors.shape[2]))
+        phasors = phasors * rotation[:, None, :]
         table = table._replace(
             force=table.force * np.abs(lead), force_std=table.force_std * np.abs(lead)
         )
@@ -164,12 +166,11 @@ def number_levels(
     drive: Float[np.ndarray, " state"] | None,
     frequency: Float[np.ndarray, " state"],
 ) -> tuple[Int[np.ndarray, " state"], str]:
-    """The level of each state, from 1 on, and the word by which they were numbered, if any.
+    """The level of each state, from 1 on, and the rule by which they were numbered, if any.
 
-    A number is the level of all; *force* and *drive* group the states by that amplitude, from the
-    smallest on; *runs* begins a new level where the frequency turns back to where a run began;
-    *auto* takes the drive where there is one, else the force where its groups stand apart, else
-    runs.
+    A number is the level of all; *force* and *drive* group the states by that amplitude, in
+    ascending order; *runs* begins a new level where the frequency reverses or jumps back; *auto*
+    uses the drive if there is one, otherwise the force if its groups are distinct, otherwise runs.
     """
     if not isinstance(level, str):
         if isinstance(level, bool) or int(level) != level:
@@ -195,11 +196,11 @@ def _number(recording: TimeRecording, name: str, what: str) -> int:
 
 
 def _groups(amplitude: Float[np.ndarray, " state"] | None) -> tuple[np.ndarray, float]:
-    """Levels by gaps between sorted log amplitudes, and the widest level's spread."""
+    """Levels by gaps between sorted log amplitudes, and the largest spread of a level."""
     level = np.log(np.asarray(amplitude, dtype=float))
     order = np.argsort(level, kind="stable")
     steps = np.diff(level[order])
-    # A gap is larger than steps within a level are.
+    # A gap is larger than the steps within a level.
     within = np.median(steps) if len(steps) else 0.0
     cut = steps > max(_GAP, 5 * within)
     number = np.empty(len(level), dtype=int)
@@ -209,14 +210,14 @@ def _groups(amplitude: Float[np.ndarray, " state"] | None) -> tuple[np.ndarray, 
 
 
 def _runs(frequency: np.ndarray) -> np.ndarray:
-    """A new level where the frequency jumps back against its direction by several steps."""
+    """A new level where the frequency reverses or jumps by several steps."""
     steps = np.diff(frequency)
     typical = np.median(np.abs(steps)) if len(steps) else 0.0
     number, direction, numbers = 1, 0.0, [1]
     for step in steps:
-        turns = direction != 0 and np.sign(step) != direction and step != 0
+        reverses = direction != 0 and np.sign(step) != direction and step != 0
         leaps = abs(step) > 3 * typical
-        if turns or leaps:
+        if reverses or leaps:
             number, direction = number + 1, 0.0
         elif step != 0:
             direction = float(np.sign(step))

@@ -1,1 +1,1 @@
-"""Slow sweeps: phasors on the way, what the sweep does to a resonance, and its removal."""
+"""Slow sweeps: phasors, the bias of a resonance by the sweep, and its correction."""

@@ -1,4 +1,4 @@
-"""Steady states from slow sweeps, the bias of the sweep taken out."""
+"""Steady states from slow sweeps, corrected for the bias of the sweep."""
 
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
@@ -28,8 +28,8 @@ from snrmjax.measure.sweeps.sweep_runs import LEAST_RANGE, Sweep, sweep_runs, tr
 from snrmjax.measure.sweeps.swept_phasors import SweptPhasors, swept_phasors
 from snrmjax.measure.sweeps.swept_table import (
     Moment,
-    held_force,
     reference_response,
+    steady_force,
     swept_moment,
     swept_motion,
     table_of,
@@ -40,15 +40,15 @@ from snrmjax.numerics.rules import POSITIVE, require
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
 
-_START = 60  # states a sweep before the grid is made finer where the response changes
+_START = 60  # states per sweep before refinement where the response changes
 _CHORD = 0.08  # of the largest response between neighbouring states
 _ROUNDS = 3
-_MUCH = 0.3  # of the force that may be taken to move the phasor
-_BLURRED = 0.1  # relative error of a phasor from which on the window is too wide for it
+_MUCH = 0.3  # largest correction, of the force
+_BLURRED = 0.1  # relative error of a phasor above which the window is too wide
 
 
 class SweepStatus(Status):
-    """Whether a moment of a sweep became a steady state, or why it did not."""
+    """Whether a moment of a sweep gave a steady state, or why it did not."""
 
     FOUND = 0, "found"
     OUTSIDE = 1, "the window leaves the sweep, or samples are missing"
@@ -65,17 +65,17 @@ class SweptStates(AbstractResult):
     sweeps: tuple[Sweep, ...] = eqx.field(static=True)
     bias: tuple[SweepBias | None, ...] = eqx.field(static=True)  # at resonance, uncorrected
     balance: ModalBalance
-    sweep: Int[np.ndarray, " state"] = quantity("state", "1", "sweep from which it is")
-    time: Float[np.ndarray, " state"] = quantity("state", "s", "when it was passed", name="time_s")
-    # That moved the phasor instead of holding it, and was taken out.
+    sweep: Int[np.ndarray, " state"] = quantity("state", "1", "number of its sweep")
+    time: Float[np.ndarray, " state"] = quantity("state", "s", "time in the record", name="time_s")
+    # The part of the force that changed the phasor instead of sustaining it.
     sweep_inertia_fraction: Complex[np.ndarray, " state"] = quantity(
-        "state", "1", "share of the force taken out"
+        "state", "1", "fraction of the force subtracted"
     )
     corrected: bool = setting()
-    notes: tuple[Fact | str, ...] = setting()  # the bias of all sweeps, and what is missing
+    notes: tuple[Fact | str, ...] = setting()  # the bias of the sweeps, and omitted moments
 
     def variables(self) -> dict[str, Variable]:
-        """By state, with its frequency."""
+        """Columns by state, with its frequency."""
         hertz = np.asarray(self.states.frequency) / HERTZ
         return {
             **super().variables(),
@@ -99,21 +99,21 @@ def sweep_states(
 ) -> SweptStates:
     """Steady states from the time record of slow linear or logarithmic sweeps.
 
-    Around each frequency the harmonics and how they change are fitted over a window of a chirp. A
-    state of a sweep is the steady state of another force: what the change of the phasor needs is
-    taken from the force, so that amplitude and frequency stay those that were measured.
+    Around each frequency the harmonics and their rates are fitted over a window of the chirp. A
+    state of a sweep is the steady state of another force: the part of the force that changes the
+    phasor is subtracted, so that amplitude and frequency remain those measured.
 
     Arguments: `force`, `responses`, `harmonic_order`, `level`, `sensors`, `drive` and `is_base`
-    as in `stepped_sine_states`; `frequencies` in rad/s at which states are wanted (by default a
-    grid that is finer where the response changes); `cycles` is the width of the window; `correct`
-    takes the bias of the sweep out (without it, and where it cannot be told, 1σ holds the bias).
-    Returns `SweptStates` with the bias that each sweep has at resonance without correction.
-    Raises `ValueError` for channels that do not fit, a record in which no sweep is found, windows
-    of fewer than six cycles, fewer than four samples a cycle, frequencies outside every sweep and
-    a record of which no state can be told.
-    Validity: one mode near its resonance; the correction's error is stated by that of the modal
-    constant and of the phasor's derivatives, and grows where the window is longer than the time
-    in which the phasor changes (jumps are left out).
+    as in `stepped_sine_states`; `frequencies` in rad/s of the states (by default a grid that is
+    finer where the response changes); `cycles` is the width of the window; `correct` removes the
+    bias of the sweep (without it, and if it is unknown, 1σ includes the bias).
+    Returns `SweptStates` with the bias of each sweep at resonance without correction.
+    Raises `ValueError` for unsuitable channels, a record without a sweep, windows of fewer than
+    six cycles, fewer than four samples per cycle, frequencies outside every sweep and a record
+    that gives no state.
+    Validity: one mode near its resonance; the error of the correction is propagated from the modal
+    constant and the phasor's derivatives, and grows if the window is longer than the time in which
+    the phasor changes (jumps are excluded).
     Reference: G. Gloth & M. Sinapius, Mech. Syst. Signal Process. 18 (2004) 1421.
 
     >>> from snrmjax.measure import Channel, time_recording
@@ -140,7 +140,7 @@ def sweep_states(
     runs = sweep_runs(track, phase)
     if not runs:
         raise ValueError(
-            f"the record has no sweep: the frequency of channel {guide} does not move by "
+            f"the record has no sweep: the frequency of channel {guide} does not change by "
             f"{100 * LEAST_RANGE:g} % in one direction (steps? `stepped_sine_states` reads them)."
         )
     fastest = max(float(np.max(track_speed(track, phase)[rows])) for rows in runs)
@@ -153,7 +153,7 @@ def sweep_states(
 
 
 class _Reader(NamedTuple):
-    """What phasors of moments are read with."""
+    """Data and settings for reading phasors at a moment."""
 
     recording: TimeRecording
     chosen: ChosenChannels
@@ -163,7 +163,7 @@ class _Reader(NamedTuple):
     highest: int
 
     def at(self, rows: slice, omega: float) -> SweptPhasors | None:
-        """Phasors where a sweep has the frequency `omega` (rad/s)."""
+        """Phasors at the frequency `omega` (rad/s) of a sweep."""
         part = self.track.part(rows)
         speed = track_speed(self.track, self.phase)[rows] * self.recording.sampling_rate
         rising = speed[-1] > speed[0]
@@ -171,17 +171,17 @@ class _Reader(NamedTuple):
         goal = omega if rising else -omega
         if not ordered[0] <= goal <= ordered[-1]:
             return None
-        place = float(np.interp(goal, ordered, part.middle))
+        sample = float(np.interp(goal, ordered, part.middle))
         names = (self.chosen.force.name, *(channel.name for channel in self.chosen.responses))
         return swept_phasors(
             *(self.recording, names, part, self.phase[rows]),
-            *(omega, place, self.cycles, self.highest),
+            *(omega, sample, self.cycles, self.highest),
         )
 
     def along(
         self, rows: slice, wanted: np.ndarray | None
     ) -> list[tuple[float, SweptPhasors | None]]:
-        """Phasors at the wanted frequencies, or on a grid that is made finer."""
+        """Phasors at the wanted frequencies, or on an adaptively refined grid."""
         speed = track_speed(self.track, self.phase)[rows] * self.recording.sampling_rate
         if wanted is not None:
             inside = (wanted >= speed.min()) & (wanted <= speed.max())
@@ -195,8 +195,8 @@ class _Reader(NamedTuple):
             known = sorted((omega, at) for omega, at in passed.items() if at is not None)
             if len(known) < 2:
                 break
-            answer = np.array([at.series[1:, 0] / at.series[0, 0] for _, at in known])
-            change = np.abs(np.diff(answer, axis=0)) / np.abs(answer).max(axis=0)
+            response = np.array([at.series[1:, 0] / at.series[0, 0] for _, at in known])
+            change = np.abs(np.diff(response, axis=0)) / np.abs(response).max(axis=0)
             omegas = np.array([omega for omega, _ in known])
             coarse = (change.max(axis=1) > _CHORD) & (np.diff(omegas) > rate * edge / 2)
             for omega in (omegas[1:] + omegas[:-1])[coarse] / 2:
@@ -211,7 +211,7 @@ def _wanted(
 ) -> Float[np.ndarray, " frequency"]:
     wanted = np.asarray(frequencies, dtype=float)
     if wanted.ndim != 1 or not wanted.size:
-        raise ValueError("`frequencies` must be a vector with one frequency at least.")
+        raise ValueError("`frequencies` must be a vector of at least one frequency.")
     require("`frequencies` (rad/s)", wanted, POSITIVE)
     speed = track_speed(reader.track, reader.phase) * reader.recording.sampling_rate
     low = min(float(speed[rows].min()) for rows in runs)
@@ -241,8 +241,8 @@ def _result(
         reference = reference_response(along)
         balance = modal_balance(swept_motion(along, reference))
         corrected = correct and bool(np.isfinite(balance.constant))
-        held, held_std = held_force(moments, reference, balance, corrected)
-        fraction = 1 - held / np.array([moment.phasors.series[0, 0] for moment in moments])
+        force, force_std = steady_force(moments, reference, balance, corrected)
+        fraction = 1 - force / np.array([moment.phasors.series[0, 0] for moment in moments])
         slow = np.abs(fraction) <= _MUCH
         left_out[int(SweepStatus.TOO_FAST)] += int(np.sum(~slow))
     if not moments or not slow.any():
@@ -251,10 +251,10 @@ def _result(
             for kind, count in zip(SweepStatus, left_out, strict=True)
             if count and kind is not SweepStatus.FOUND
         )
-        nothing = "none passes the wanted frequencies, or samples are missing there"
-        raise ValueError(f"no state can be told from the sweeps: {reasons or nothing}.")
+        default = "none passes the wanted frequencies, or samples are missing there"
+        raise ValueError(f"the sweeps give no steady state: {reasons or default}.")
     kept = [moment for moment, good in zip(moments, slow, strict=True) if good]
-    table = table_of(kept, reader.chosen, held[slow], held_std[slow])
+    table = table_of(kept, reader.chosen, force[slow], force_std[slow])
     number = np.array([moment.sweep for moment in kept])
     fraction = fraction[slow]
     notes = [Fact("sweep_bias_unknown")] if correct and not corrected else []
@@ -301,7 +301,7 @@ def _facts_of_sweeps(
 def _moments(
     chosen: ChosenChannels, passed: list[list[tuple[float, SweptPhasors | None]]]
 ) -> tuple[list[Moment], list[SweepStatus]]:
-    """States that can be read, and how every moment ended so far."""
+    """States that can be read, and the status of every moment."""
     moments, status = [], []
     for k, run in enumerate(passed):
         for _, phasors in run:
@@ -319,7 +319,7 @@ def _moments(
 
 
 def _bias(balance: ModalBalance, moments: list[Moment], sweep: int) -> SweepBias | None:
-    """What the sweep does to its resonance, by the mode that the balance found."""
+    """Bias of the sweep at resonance, for the mode identified by the balance."""
     mine = [moment for moment in moments if moment.sweep == sweep]
     if not mine or not np.isfinite(balance.constant):
         return None

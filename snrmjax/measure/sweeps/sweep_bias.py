@@ -1,8 +1,8 @@
-"""What a sweep does to a resonance: its apparent frequency, height and width.
+"""Bias of a resonance by a sweep: apparent frequency, height and width.
 
 Near a lightly damped resonance the phasor of the displacement obeys ȧ = −(ζω + i(Ω − ω)) a + F/2iω.
-Swept at a constant rate, Ω − ω = rt, its answer is an integral of Gauss's function with a complex
-argument; it depends on the normalised rate η = Q² |df/dt| / f² alone, Q = 1/(2ζ).
+At a constant sweep rate, Ω − ω = rt, the response is a Gaussian integral with a complex argument
+(Faddeeva function); it depends only on the normalised rate η = Q² |df/dt| / f², Q = 1/(2ζ).
 
 References: J. A. Lollock, AIAA 2002-1230 (normalised rate; lowered peak); G. Gloth & M. Sinapius,
 Mech. Syst. Signal Process. 18 (2004) 1421 (apparent frequency and damping of swept modes).
@@ -14,9 +14,9 @@ import numpy as np
 
 from snrmjax.numerics.rules import BETWEEN_ZERO_AND_ONE, POSITIVE, require
 
-_REACH = 12.0  # half bandwidths about resonance in which the peak is sought
+_REACH = 12.0  # half bandwidths about resonance, the range searched for the peak
 _POINTS = 4001
-_FASTEST = 10.0  # normalised rate up to which there is a half-power width
+_FASTEST = 10.0  # largest normalised rate with a half-power width
 
 
 class SweepBias(NamedTuple):
@@ -29,12 +29,12 @@ class SweepBias(NamedTuple):
 
 
 def sweep_bias(natural_frequency: float, damping_ratio: float, rate: float) -> SweepBias:
-    """Height, frequency and half-power damping that a sweep through a linear resonance shows.
+    """Apparent height, frequency and half-power damping in a sweep through a linear resonance.
 
     Arguments: `natural_frequency` in rad/s; `rate` dΩ/dt in rad/s² at resonance, negative
     downwards (a logarithmic sweep of R octaves/s has Ω R ln 2).
     Returns `SweepBias`. Raises `ValueError` for numbers that are not positive, or a rate that is
-    not finite, and for η above 10, where there is no half-power width any more.
+    not finite, and for η above 10, where the half-power width is not defined.
     Validity: one linear mode, lightly damped; within 2 % of a time integration below η = 1.
 
     >>> found = sweep_bias(2 * np.pi * 20, 0.01, 2 * np.pi * 0.02)
@@ -49,20 +49,23 @@ def sweep_bias(natural_frequency: float, damping_ratio: float, rate: float) -> S
     normalised = np.pi / 2 * curvature
     if normalised > _FASTEST:
         raise ValueError(
-            f"the sweep of {rate:g} rad/s² is too fast for a resonance to be read: its normalised "
-            f"rate is {normalised:.3g}, more than {_FASTEST:g}."
+            f"the sweep of {rate:g} rad/s² is too fast for a resonance peak: its normalised rate "
+            f"is {normalised:.3g}, more than {_FASTEST:g}."
         )
-    place = np.linspace(-_REACH, _REACH * (1 + curvature), _POINTS)
-    size = np.abs(_answer(place, curvature))
-    top = int(np.argmax(size))
-    shift, peak = _parabola(place[top - 1 : top + 2], size[top - 1 : top + 2])
+    detuning = np.linspace(-_REACH, _REACH * (1 + curvature), _POINTS)
+    amplitude = np.abs(_response(detuning, curvature))
+    top = int(np.argmax(amplitude))
+    shift, peak = _parabola(detuning[top - 1 : top + 2], amplitude[top - 1 : top + 2])
     level = peak / np.sqrt(2)
-    above = np.flatnonzero(size >= level)
+    above = np.flatnonzero(amplitude >= level)
     rise, fall = above[above <= top], above[above >= top]
-    # From the peak outwards to the first crossing: what beats behind is another matter.
+    # From the peak outwards to the first crossing: the beats of the ring-down are ignored.
     left = rise[np.flatnonzero(np.diff(rise, prepend=rise[0] - 2) > 1)[-1]]
     right = fall[np.flatnonzero(np.diff(fall, append=fall[-1] + 2) > 1)[0]]
-    width = _crossing(place, size, left - 1, level), _crossing(place, size, right, level)
+    width = (
+        _crossing(detuning, amplitude, left - 1, level),
+        _crossing(detuning, amplitude, right, level),
+    )
     return SweepBias(
         float(normalised),
         float(peak),
@@ -74,18 +77,18 @@ def sweep_bias(natural_frequency: float, damping_ratio: float, rate: float) -> S
 def sweep_bias_where_slow(
     natural_frequency: float, damping_ratio: float, rate: float
 ) -> SweepBias | None:
-    """`sweep_bias`, or None for a sweep that is too fast for a peak to be read."""
+    """`sweep_bias`, or None for a sweep that is too fast for a peak."""
     curvature = abs(rate) / (damping_ratio * natural_frequency) ** 2
     if not np.pi / 2 * curvature <= _FASTEST:
         return None
     return sweep_bias(natural_frequency, damping_ratio, rate)
 
 
-def _answer(place: np.ndarray, curvature: float) -> np.ndarray:
+def _response(detuning: np.ndarray, curvature: float) -> np.ndarray:
     """Phasor over its steady peak, ∫₀^∞ exp(−(1 + ix)σ + iκσ²/2) dσ."""
     from scipy.special import wofz
 
-    decay = 1 + 1j * place
+    decay = 1 + 1j * detuning
     if curvature < 1e-9:
         return 1 / decay
     root = np.sqrt(-0.5j * curvature)

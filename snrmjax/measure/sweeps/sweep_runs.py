@@ -1,4 +1,4 @@
-"""Sweeps of a record: stretches in which the frequency of the drive moves in one direction."""
+"""Sweeps of a record: stretches of monotonic drive frequency."""
 
 from typing import NamedTuple
 
@@ -7,11 +7,11 @@ from jaxtyping import Float
 
 from snrmjax.measure.recordings.tone_track import ToneTrack
 
-LEAST_RANGE = 0.02  # relative, that a sweep covers at least
-_TURN = 0.02  # of the range of log frequency: a sweep turns where it goes back by more
+LEAST_RANGE = 0.02  # least relative frequency range of a sweep
+_TURN = 0.02  # of the range of log frequency: larger reversals end a sweep
 _FEWEST_FRAMES = 8
-_GAP = 1.6  # hops between frames, above which something was missing
-_JUMP = 0.1  # of log frequency from frame to frame: another sweep begins
+_GAP = 1.6  # hops between frames, above which data are missing
+_JUMP = 0.1  # of log frequency between frames: another sweep begins
 
 
 class Sweep(NamedTuple):
@@ -24,12 +24,12 @@ class Sweep(NamedTuple):
 
 
 def track_speed(track: ToneTrack, phase: np.ndarray) -> Float[np.ndarray, " frame"]:
-    """Frequency in rad a sample at every frame, by the phase of its neighbours."""
+    """Frequency in rad per sample at every frame, from the phases of its neighbours."""
     return np.gradient(phase, track.middle)
 
 
 def sweep_runs(track: ToneTrack, phase: np.ndarray) -> list[slice]:
-    """Stretches of frames in which the frequency moves in one direction."""
+    """Stretches of frames with monotonic frequency."""
     if len(track.middle) < _FEWEST_FRAMES:
         return []
     level = np.log(np.maximum(track_speed(track, phase), np.finfo(float).tiny))
@@ -38,18 +38,18 @@ def sweep_runs(track: ToneTrack, phase: np.ndarray) -> list[slice]:
     )
     jumps = np.flatnonzero(np.abs(np.diff(np.log(track.frequency))) > _JUMP)
     breaks = {int(k) + 1 for k in (*gaps, *jumps)}
-    turn = _TURN * float(np.ptp(np.log(track.frequency)))
+    reversal = _TURN * float(np.ptp(np.log(track.frequency)))
     cuts, extreme, direction = [0], 0, 0
     for k in range(1, len(level)):
         if k in breaks:
             cuts, extreme, direction = [*cuts, k], k, 0
             continue
         moved = level[k] - level[extreme]
-        if direction == 0 and abs(moved) > turn:
+        if direction == 0 and abs(moved) > reversal:
             direction, extreme = int(np.sign(moved)), k
         elif direction * moved > 0:
             extreme = k
-        elif direction and -direction * moved > turn:
+        elif direction and -direction * moved > reversal:
             cuts, direction, extreme = [*cuts, extreme], -direction, k
     ends = [*cuts[1:], len(level)]
     return [

@@ -1,8 +1,8 @@
-"""Phasors of a swept record at chosen moments, and how they change: local least squares.
+"""Phasors of a swept record at given moments, with derivatives: local least squares.
 
 Around each moment the record is m + m't + Re Σ_k (z_k + ż_k t + …) e^{ikθ(t)} with the phase θ of
-the drive as a cubic of time. The fundamental has a cubic, higher harmonics a straight line, so that
-the phasor and its first two derivatives follow with their errors.
+the drive cubic in time. The fundamental is cubic, higher harmonics are linear, so that the phasor
+and its first two derivatives follow with their errors.
 """
 
 from typing import NamedTuple
@@ -15,11 +15,11 @@ from snrmjax.measure.recordings.tone_track import ToneTrack
 
 DEGREE = 3
 _FEWEST_FRAMES = 5
-_FINE = (3, 12)  # bins beside the fundamental that say what noise there is
+_FINE = (3, 12)  # bins next to the fundamental, for the noise level
 
 
 class SweptPhasors(NamedTuple):
-    """What was found at one moment; series are coefficients of time, t⁰ to t³, in the SI unit."""
+    """Phasors at one moment; series are coefficients of t⁰ to t³, in SI units."""
 
     time: float  # s
     rate: Float[np.ndarray, " power"]  # Ω(t), rad/s: three coefficients
@@ -37,26 +37,26 @@ def swept_phasors(
     track: ToneTrack,
     phase: Float[np.ndarray, " frame"],
     wanted: float,
-    place: float,
+    sample: float,
     cycles: float,
     highest: int,
 ) -> SweptPhasors | None:
-    """Phasors at the moment at which the drive has the frequency `wanted` (rad/s).
+    """Phasors at the moment when the drive has the frequency `wanted` (rad/s).
 
-    Arguments: `track` and its unwrapped `phase`; `place` is about the sample of that moment;
-    `cycles` is the width of the window. None where the window leaves the track or has samples that
-    are not finite.
+    Arguments: `track` and its unwrapped `phase`; `sample` is a first estimate of that moment;
+    `cycles` is the width of the window. None if the window leaves the track or has non-finite
+    samples.
     """
     rate = recording.sampling_rate
     width = 2 * np.pi * cycles / wanted * rate
     for _ in range(3):
-        law = _phase_law(track, phase, place, width)
+        law = _phase_law(track, phase, sample, width)
         if law is None:
             return None
         step = (wanted / rate - law[1]) / (2 * law[2]) if law[2] else 0.0
-        place += float(np.clip(step, -width / 4, width / 4))
-    law = _phase_law(track, phase, place, width)
-    middle = round(place)
+        sample += float(np.clip(step, -width / 4, width / 4))
+    law = _phase_law(track, phase, sample, width)
+    middle = round(sample)
     half = int(width / 2)
     start, stop = middle - half, middle + half + 1
     if law is None or start < 0 or stop > recording.n_samples:
@@ -64,20 +64,20 @@ def swept_phasors(
     values = recording.values(names, start, stop)
     if not np.isfinite(values).all():
         return None
-    away = np.arange(start, stop) - place
+    away = np.arange(start, stop) - sample
     whole = _fit(values, away, law, highest)
     inner = np.abs(away) <= half / 2
     narrow = _fit(values[:, inner], away[inner], law, highest)
-    # What the narrower window sees otherwise, beyond chance, is the bias of the wider one.
+    # The difference to the narrower window, beyond noise, is the bias of the wider one.
     differs = np.abs(narrow.series - whole.series) ** 2
     bias = np.maximum(0.0, differs - 2 * narrow.std**2)
     powers = rate ** np.arange(DEGREE + 1)
-    turns = np.array([law[1], 2 * law[2], 3 * law[3]]) * rate ** np.arange(1, 4)
+    frequency = np.array([law[1], 2 * law[2], 3 * law[3]]) * rate ** np.arange(1, 4)
     largest = np.abs(values).max(axis=1, keepdims=True)
     flat = np.count_nonzero(np.abs(values) >= largest * (1 - 1e-9), axis=1)
     return SweptPhasors(
-        recording.start_time + place / rate,
-        turns,
+        recording.start_time + sample / rate,
+        frequency,
         whole.series * powers,
         np.sqrt(whole.std**2 + bias) * powers,
         whole.harmonics,
@@ -96,18 +96,18 @@ class _Fit(NamedTuple):
 
 
 def _phase_law(
-    track: ToneTrack, phase: np.ndarray, place: float, width: float
+    track: ToneTrack, phase: np.ndarray, sample: float, width: float
 ) -> Float[np.ndarray, " power"] | None:
-    """Coefficients of the phase (rad) by time in samples from `place`, from the frames around."""
-    near = int(np.searchsorted(track.middle, place))
+    """Coefficients of the phase (rad) by time in samples from `sample`, from nearby frames."""
+    near = int(np.searchsorted(track.middle, sample))
     if near in (0, len(track.middle)):
         return None
     reach = width / 2 + track.length[near]
     rows = slice(
-        int(np.searchsorted(track.middle, place - reach)),
-        int(np.searchsorted(track.middle, place + reach)),
+        int(np.searchsorted(track.middle, sample - reach)),
+        int(np.searchsorted(track.middle, sample + reach)),
     )
-    away = track.middle[rows] - place
+    away = track.middle[rows] - sample
     if len(away) < _FEWEST_FRAMES or away[0] > -width / 4 or away[-1] < width / 4:
         return None
     scale = np.abs(away).max()
@@ -120,12 +120,12 @@ def _phase_law(
 def _fit(values: np.ndarray, away: np.ndarray, law: np.ndarray, highest: int) -> _Fit:
     half = np.abs(away).max()
     scaled = away / half
-    turn = np.exp(1j * np.polynomial.polynomial.polyval(away, law))
+    carrier = np.exp(1j * np.polynomial.polynomial.polyval(away, law))
     powers = scaled ** np.arange(DEGREE + 1)[:, None]
     columns = [*powers[:2]]
-    parts = [(powers * turn.real, -powers * turn.imag)]
+    parts = [(powers * carrier.real, -powers * carrier.imag)]
     for order in range(2, highest + 1):
-        parts.append((powers[:2] * (turn**order).real, -powers[:2] * (turn**order).imag))
+        parts.append((powers[:2] * (carrier**order).real, -powers[:2] * (carrier**order).imag))
     design = np.concatenate([np.stack(columns), *(row for pair in parts for row in pair)])
     inverse = np.linalg.inv(design @ design.T)
     fitted = values @ (inverse @ design).T
@@ -146,7 +146,7 @@ def _fit(values: np.ndarray, away: np.ndarray, law: np.ndarray, highest: int) ->
 
 
 def _colour(rest: np.ndarray, step: float) -> np.ndarray:
-    """Power of the residual beside the fundamental over its mean, 1 at least."""
+    """Power of the residual next to the fundamental over its mean, at least 1."""
     n = rest.shape[1]
     power = np.abs(np.fft.rfft(rest * np.hanning(n), axis=1)) ** 2
     centre = round(step * n / (2 * np.pi))
@@ -163,14 +163,14 @@ def displacement_series(
 ) -> Complex[np.ndarray, "channel power"]:
     """Phasor of the displacement and its derivatives from that of a velocity or acceleration.
 
-    A velocity w e^{iθ} is the derivative of a e^{iθ}: w = ȧ + iΩ a, solved for a by repetition.
+    A velocity w e^{iθ} is the derivative of a e^{iθ}: w = ȧ + iΩ a, solved for a by iteration.
     """
-    turning = np.zeros(series.shape[-1], dtype=complex)
-    turning[: len(rate)] = 1j * rate
+    i_omega = np.zeros(series.shape[-1], dtype=complex)
+    i_omega[: len(rate)] = 1j * rate
     for _ in range(integrations):
-        solved = _divided(series, turning)
+        solved = _divided(series, i_omega)
         for _ in range(DEGREE):
-            solved = _divided(series - _derivative(solved), turning)
+            solved = _divided(series - _derivative(solved), i_omega)
         series = solved
     return series
 

@@ -1,4 +1,4 @@
-"""Phasors of a sweep's moments as a table of steady states, each with the force that holds it."""
+"""Swept phasors as a table of steady states, each with the force that would sustain it."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from snrmjax.measure.sweeps.swept_phasors import SweptPhasors, displacement_seri
 
 
 class Moment(NamedTuple):
-    """One state on its way from the sweep."""
+    """The phasors of a sweep at one moment."""
 
     sweep: int
     phasors: SweptPhasors
@@ -21,7 +21,7 @@ class Moment(NamedTuple):
 
 
 def swept_moment(chosen: ChosenChannels, sweep: int, phasors: SweptPhasors) -> Moment:
-    """The displacements of all responses at one moment, whatever motion was recorded."""
+    """The displacements of all responses at one moment, from any recorded motion."""
     motion, std = [], []
     rows = (chosen.responses, phasors.series[1:], phasors.std[1:])
     for channel, series, error in zip(*rows, strict=True):
@@ -32,14 +32,14 @@ def swept_moment(chosen: ChosenChannels, sweep: int, phasors: SweptPhasors) -> M
 
 
 def reference_response(moments: list[Moment]) -> int:
-    """The response that stands out of its noise most."""
-    size = np.abs([moment.motion[:, 0] for moment in moments])
-    ratio = size / np.fmax([moment.motion_std[:, 0] for moment in moments], 1e-300)
+    """The response with the largest signal-to-noise ratio."""
+    amplitude = np.abs([moment.motion[:, 0] for moment in moments])
+    ratio = amplitude / np.fmax([moment.motion_std[:, 0] for moment in moments], 1e-300)
     return int(np.argmax(np.median(ratio, axis=0)))
 
 
 def swept_motion(moments: list[Moment], reference: int) -> SweptMotion:
-    """Force and displacement of one response, with how the displacement changes."""
+    """Force, and displacement of one response with its derivatives."""
     series = np.array([moment.motion[reference] for moment in moments])
     return SweptMotion(
         np.array([moment.phasors.rate[0] for moment in moments]),
@@ -52,48 +52,48 @@ def swept_motion(moments: list[Moment], reference: int) -> SweptMotion:
     )
 
 
-def held_force(
+def steady_force(
     moments: list[Moment], reference: int, balance: ModalBalance, corrected: bool
 ) -> tuple[Complex[np.ndarray, " state"], Float[np.ndarray, " state"]]:
-    """Force that would hold each state, and the rms of its complex error.
+    """Force that would sustain each state, and the rms of its complex error.
 
-    Without correction the error holds what the sweep may have done.
+    Without correction the error includes the estimated bias of the sweep.
     """
     motion = swept_motion(moments, reference)
     std = np.array([moment.phasors.std[0, 0] for moment in moments])
     if not corrected:
         return motion.force, np.hypot(std, np.abs(motion.force) * fraction_of_bias(motion))
-    moving = balance.force_to_move(motion)
+    transient = balance.force_to_move(motion)
     of_slope = 2 * motion.frequency * motion.first_std / abs(balance.constant)
-    of_constant = np.abs(moving) * balance.constant_std / abs(balance.constant)
-    return motion.force - moving, np.sqrt(std**2 + of_slope**2 + of_constant**2)
+    of_constant = np.abs(transient) * balance.constant_std / abs(balance.constant)
+    return motion.force - transient, np.sqrt(std**2 + of_slope**2 + of_constant**2)
 
 
 def table_of(
     moments: list[Moment],
     chosen: ChosenChannels,
-    held: Complex[np.ndarray, " state"],
-    held_std: Float[np.ndarray, " state"],
+    force: Complex[np.ndarray, " state"],
+    force_error: Float[np.ndarray, " state"],
 ) -> PhasorTable:
-    """Phasors relative to the force that holds each state, with their errors."""
+    """Phasors relative to the sustaining force of each state, with their errors."""
     omega = np.array([moment.phasors.rate[0] for moment in moments])
     phasors = np.array([moment.phasors.harmonics[1:] for moment in moments])
     times = np.array([DERIVATIVE[moment.quantity] for moment in chosen.responses])
     # A steady motion of the same displacement.
     steady = np.array([moment.motion[:, 0] for moment in moments])
     phasors[:, :, 0] = steady * (1j * omega[:, None]) ** times
-    unit = held / np.abs(held)
+    unit = force / np.abs(force)
     order = 1 + np.arange(phasors.shape[2])
     std = np.array([moment.phasors.std[1:, 0] for moment in moments]) / np.sqrt(2)
-    force_std = held_std / np.sqrt(2)
+    force_std = force_error / np.sqrt(2)
     return PhasorTable(
         np.array([moment.phasors.time for moment in moments]),
         omega,
-        np.abs(held),
+        np.abs(force),
         force_std,
         phasors * unit.conj()[:, None, None] ** order,
         np.array([moment.phasors.mean[1:] for moment in moments]),
         std,
-        np.hypot(std / np.abs(phasors[:, :, 0]), (force_std / np.abs(held))[:, None]),
+        np.hypot(std / np.abs(phasors[:, :, 0]), (force_std / np.abs(force))[:, None]),
         np.array([moment.phasors.harmonic_std[1:] for moment in moments]),
     )

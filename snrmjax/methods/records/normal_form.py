@@ -1,10 +1,10 @@
 """The motion on a two-dimensional spectral submanifold in its polynomial normal form.
 
-In normal-form coordinates z = ρ e^{iθ} a decaying mode obeys ρ̇ = ρ α(ρ²), θ̇ = ω(ρ²), and what a
-sensor sees is a polynomial of z and its conjugate. Near-identity changes of z that keep the form
-leave one freedom, which is used up by letting ρ be the fundamental amplitude of the sensor:
+In normal-form coordinates z = ρ e^{iθ} a decaying mode obeys ρ̇ = ρ α(ρ²), θ̇ = ω(ρ²), and a
+sensor's signal is a polynomial of z and its conjugate. Near-identity changes of z that keep the
+form leave one free choice: here ρ is the fundamental amplitude at the sensor,
 v = ρ cos θ + Σ_h Re[(c_h + d_h ρ²) ρ^h e^{ihθ}] + offset + e ρ². Where the elastic force has even
-terms (an arch, a one-sided stop) the middle of the motion moves as it decays: that is e.
+terms (an arch, a one-sided stop) the mean of the motion changes as it decays: that is e.
 
 References: S. Jain & G. Haller, Nonlinear Dyn. 107 (2022) 1417, doi:10.1007/s11071-021-06957-4
 (polar normal form); T. Breunung & G. Haller, Proc. R. Soc. A 474 (2018) 20180083,
@@ -27,7 +27,7 @@ _MOST_NODES = 2000
 
 
 class NormalForm(NamedTuple):
-    """Amplitude and phase dynamics, and the harmonics that the sensor sees."""
+    """Amplitude and phase dynamics, and the harmonics of the sensor's signal."""
 
     decay: Float[np.ndarray, " term"]  # α = Σ decay_k T_k(2(ρ/scale)² − 1), Chebyshev's T, 1/s
     frequency: Float[np.ndarray, " term"]  # ω likewise, rad/s
@@ -46,7 +46,7 @@ class NormalForm(NamedTuple):
         return chebyshev.chebval(2 * (amplitude / self.scale) ** 2 - 1, self.frequency)
 
     def modal_damping(self, amplitude: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Power lost over ½ m V² (1/s), as at phase resonance: 2ζ̃ω̃.
+        """Dissipated power over ½ m V² (1/s), as at phase resonance: 2ζ̃ω̃.
 
         The energy of a conservative motion changes by its frequency times the change of its
         action, dE = ω dJ with J = m V² (1 + h)/(2ω), h the power of the harmonics over that of
@@ -55,18 +55,18 @@ class NormalForm(NamedTuple):
         ratio = amplitude / self.scale
         alpha, omega = self.decay_rate(amplitude), self.angular_frequency(amplitude)
         slope_of = chebyshev.chebder(self.frequency)  # by 2(ρ/scale)²: d/d ln ρ is 4(ρ/scale)²
-        bend = 4 * ratio**2 * chebyshev.chebval(2 * ratio**2 - 1, slope_of) / omega
+        frequency_slope = 4 * ratio**2 * chebyshev.chebval(2 * ratio**2 - 1, slope_of) / omega
         power, slope = np.zeros_like(ratio), np.zeros_like(ratio)
         for order, (first, second) in zip(self.orders, self.harmonics, strict=True):
-            size = (first + second * ratio**2) * ratio ** (order - 1) / self.scale
-            rise = (order - 1) * size + 2 * second * ratio ** (order + 1) / self.scale
-            power += np.abs(size) ** 2
-            slope += 2 * np.real(np.conj(size) * rise)
-        return -2 * alpha * ((1 + power) * (1 - bend / 2) + slope / 2)
+            harmonic = (first + second * ratio**2) * ratio ** (order - 1) / self.scale
+            rise = (order - 1) * harmonic + 2 * second * ratio ** (order + 1) / self.scale
+            power += np.abs(harmonic) ** 2
+            slope += 2 * np.real(np.conj(harmonic) * rise)
+        return -2 * alpha * ((1 + power) * (1 - frequency_slope / 2) + slope / 2)
 
 
-class Seen(NamedTuple):
-    """The record that a normal form gives, and how it changes with each unknown."""
+class SensorSignal(NamedTuple):
+    """The sensor's signal of a normal form, and its sensitivities to the unknowns."""
 
     signal: Float[np.ndarray, " sample"]
     jacobian: Float[np.ndarray, "sample unknown"]
@@ -75,7 +75,7 @@ class Seen(NamedTuple):
 
 
 def unknowns_of(form: NormalForm) -> Float[np.ndarray, " unknown"]:
-    """Start, decay, frequency, harmonics (real and imaginary parts) and offset in a row."""
+    """Start, decay, frequency, harmonics (real and imaginary parts) and middle as one vector."""
     parts = form.harmonics.ravel()
     return np.concatenate(
         [form.start, form.decay, form.frequency, parts.real, parts.imag, form.middle]
@@ -85,78 +85,83 @@ def unknowns_of(form: NormalForm) -> Float[np.ndarray, " unknown"]:
 def form_of(
     unknowns: Float[np.ndarray, " unknown"], terms: int, orders: Sequence[int], scale: float
 ) -> NormalForm:
-    """A normal form from its unknowns, as `unknowns_of` puts them in a row."""
+    """A normal form from its unknowns, in the order of `unknowns_of`."""
     start, decay, frequency, rest = np.split(unknowns, [2, 2 + terms, 2 + 2 * terms])
     parts = rest[:-2].reshape(2, len(orders), 2)
     harmonics = parts[0] + 1j * parts[1]
     return NormalForm(decay, frequency, harmonics, tuple(orders), rest[-2:], scale, np.array(start))
 
 
-def seen(form: NormalForm, time: Float[np.ndarray, " sample"]) -> Seen:
-    """What the sensor records of the decaying motion, and its derivatives.
+def sensor_signal(form: NormalForm, time: Float[np.ndarray, " sample"]) -> SensorSignal:
+    """The sensor's signal of the decaying motion, and its sensitivities.
 
-    Amplitude and phase, and their derivatives by start and coefficients, are one slow system of
-    ordinary differential equations. Raises `ArithmeticError` where it cannot be integrated.
+    Amplitude and phase, and their derivatives with respect to start and coefficients, are one
+    slow system of ordinary differential equations. Raises `ArithmeticError` where it cannot be
+    integrated.
     """
     terms = len(form.decay)
     slow = _slow_flow(form, time)
     log_ratio, phase = slow[0], slow[1]
     ratio = np.exp(np.minimum(log_ratio, 0.5 * np.log(_LARGEST)))
-    turn = np.exp(1j * phase)
+    phasor = np.exp(1j * phase)
     amplitude = form.scale * ratio
-    wanders = form.middle[1] * ratio**2
-    signal = amplitude * turn.real + form.middle[0] + wanders
-    # Derivatives of the signal by ln ρ and by θ, harmonics included.
-    by_size, by_phase = amplitude * turn.real + 2 * wanders, -amplitude * turn.imag
+    middle = form.middle[1] * ratio**2
+    signal = amplitude * phasor.real + form.middle[0] + middle
+    # Derivatives of the signal with respect to ln ρ and θ, harmonics included.
+    by_amplitude, by_phase = amplitude * phasor.real + 2 * middle, -amplitude * phasor.imag
     linear: list[list[np.ndarray]] = [[], []]
     for order, pair in zip(form.orders, form.harmonics, strict=True):
-        rotating = turn**order
+        rotating = phasor**order
         for extra, coefficient in zip((0, 2), pair, strict=True):
             wave = ratio ** (order + extra) * rotating
             part = coefficient * wave
             signal = signal + part.real
-            by_size = by_size + (order + extra) * part.real
+            by_amplitude = by_amplitude + (order + extra) * part.real
             by_phase = by_phase - order * part.imag
             linear[0].append(wave.real)
             linear[1].append(-wave.imag)
-    # Rows 2…: ∂ln ρ and ∂θ by ln ρ(0), by each decay; ∂θ by each frequency.
-    size_rows = slow[2 : 3 + terms]
+    # Rows 2…: ∂ln ρ and ∂θ with respect to ln ρ(0) and each decay; ∂θ for each frequency.
+    amplitude_rows = slow[2 : 3 + terms]
     phase_rows = slow[3 + terms : 4 + 2 * terms]
-    both = by_size * size_rows + by_phase * phase_rows
+    both = by_amplitude * amplitude_rows + by_phase * phase_rows
     of_frequency = by_phase * slow[4 + 2 * terms :]
     columns = [both[0], by_phase, *both[1:], *of_frequency, *linear[0], *linear[1]]
     jacobian = np.stack([*columns, np.ones_like(signal), ratio**2], axis=1)
-    return Seen(signal, jacobian, amplitude, phase)
+    return SensorSignal(signal, jacobian, amplitude, phase)
 
 
 def _slow_flow(
     form: NormalForm, time: Float[np.ndarray, " sample"]
 ) -> Float[np.ndarray, "row sample"]:
-    """ln ρ, θ and their derivatives by start and coefficients, at the record's times."""
+    """ln ρ, θ and their sensitivities to start and coefficients, at the record's times."""
     terms = len(form.decay)
-    # Values of the polynomials, and 4 r times their derivatives: d/d ln ρ.
+    # Values of the polynomials T_k(2r − 1), r = (ρ/scale)², and 4r times their derivatives:
+    # d/d ln ρ = 2r d/dr.
     values = np.eye(terms)
     roughness = chebyshev.chebder(values, axis=0)
 
     def rate(_: float, state: np.ndarray) -> np.ndarray:
         square = np.exp(2 * min(state[0], 0.5 * np.log(_LARGEST)))
-        known = chebyshev.chebval(2 * square - 1, values)
-        bent = 4 * square * chebyshev.chebval(2 * square - 1, roughness) * (square < _LARGEST)
-        size = state[2 : 3 + terms]
-        d_size, d_phase = (form.decay @ bent) * size, (form.frequency @ bent) * size
-        d_size[1:] += known
-        rates = [form.decay @ known, form.frequency @ known]
-        return np.concatenate([rates, d_size, d_phase, known])
+        polynomials = chebyshev.chebval(2 * square - 1, values)
+        log_slopes = 4 * square * chebyshev.chebval(2 * square - 1, roughness) * (square < _LARGEST)
+        sensitivity = state[2 : 3 + terms]
+        d_amplitude, d_phase = (
+            (form.decay @ log_slopes) * sensitivity,
+            (form.frequency @ log_slopes) * sensitivity,
+        )
+        d_amplitude[1:] += polynomials
+        rates = [form.decay @ polynomials, form.frequency @ polynomials]
+        return np.concatenate([rates, d_amplitude, d_phase, polynomials])
 
-    begin = np.zeros(4 + 3 * terms)
-    begin[:2], begin[2] = form.start, 1.0
+    initial = np.zeros(4 + 3 * terms)
+    initial[:2], initial[2] = form.start, 1.0
     span = time[-1] - time[0]
     cycles = span * abs(form.frequency[0]) / (2 * np.pi)
     nodes = np.linspace(0, span, int(np.clip(cycles * _NODES_A_CYCLE, 50, _MOST_NODES)))
-    found = solve_ivp(
-        rate, (0, span), begin, "DOP853", t_eval=nodes, rtol=_TOLERANCE, atol=_TOLERANCE
+    solution = solve_ivp(
+        rate, (0, span), initial, "DOP853", t_eval=nodes, rtol=_TOLERANCE, atol=_TOLERANCE
     )
-    if not found.success or not np.isfinite(found.y).all():
+    if not solution.success or not np.isfinite(solution.y).all():
         raise ArithmeticError("the amplitude of the normal form cannot be integrated.")
-    slopes_at = np.stack([rate(0.0, column) for column in found.y.T], axis=1)
-    return CubicHermiteSpline(nodes, found.y, slopes_at, axis=1)(time - time[0])
+    slopes_at = np.stack([rate(0.0, column) for column in solution.y.T], axis=1)
+    return CubicHermiteSpline(nodes, solution.y, slopes_at, axis=1)(time - time[0])

@@ -1,11 +1,11 @@
 """Polynomial nonlinear state-space model of a multisine test, and the nonlinear mode it implies.
 
-The best linear approximation of the test, with its noise and its scatter from realisation to
-realisation, gives a linear model: poles by a subspace method, then all coefficients by least
-squares weighted by that scatter. From there a model with all monomials of some degrees in its
-state equation is fitted to the mean periods, in the frequency domain, weighted by noise and by
-what the model cannot describe. Phase resonances of the fitted model by harmonic balance give
-natural frequency and, from force over velocity, damping against amplitude.
+The best linear approximation, with its noise and its scatter between realisations, gives a linear
+model: poles by a subspace method, then all coefficients by least squares weighted by that scatter.
+From this start a model with all monomials of the chosen degrees in its state equation is fitted to
+the mean periods, in the frequency domain, weighted by noise and model error. Phase resonances of
+the fitted model by harmonic balance give natural frequency and, from force over velocity, damping
+against amplitude.
 
 References: J. Paduart, L. Lauwers, J. Swevers, K. Smolders, J. Schoukens & R. Pintelon, Automatica
 46 (2010) 647, doi:10.1016/j.automatica.2010.01.001; for nonlinear modes of such models,
@@ -33,8 +33,8 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
 
 _POINTS = 25
-_SMALLEST = 0.04  # of the largest velocity: where the curves begin
-_BEYOND = 1.2  # times the noise, from which on what is left says that the model's form is another
+_SMALLEST = 0.04  # of the largest velocity: first amplitude of the curves
+_BEYOND = 1.2  # times the noise: a larger residual indicates a wrong model form
 
 
 def pnlss(
@@ -50,22 +50,22 @@ def pnlss(
 ) -> MethodResult:
     """Natural frequency and damping against amplitude from a state-space model of a multisine test.
 
-    At a phase resonance of the model force F and velocity V are in phase: its frequency is ω̃, and
-    2ζ̃ω̃ = a F/V with the model's own modal constant a.
+    At phase resonance of the model force F and velocity V are in phase: the frequency is ω̃, and
+    2ζ̃ω̃ = a F/V with the model's modal constant a.
 
     Arguments and errors as in `fit_state_space`. Returns a `MethodResult` of 25 amplitudes up to
-    the records' largest velocity, 1σ from the fit's covariance. Amplitudes at which the fitted
-    model has no phase resonance are `NO_RESONANCE`.
+    the records' largest velocity, 1σ from the covariance of the fit. Amplitudes at which the
+    fitted model has no phase resonance are `NO_RESONANCE`.
     """
     fit = fit_state_space(
         recordings, force, motion, modes,
         order=order, degrees=degrees, period=period, skip=skip,
     )  # fmt: skip
     amplitude = np.linspace(_SMALLEST, 1.0, _POINTS) * fit.largest
-    found = model_resonances(fit.model, amplitude / fit.velocity_unit, fit.exponents, fit.mode)
-    balanced = np.cumprod(np.asarray(is_balanced(found))).astype(bool)
+    resonances = model_resonances(fit.model, amplitude / fit.velocity_unit, fit.exponents, fit.mode)
+    balanced = np.cumprod(np.asarray(is_balanced(resonances))).astype(bool)
     omega, ratio, omega_std, ratio_std = _curves(
-        fit, np.asarray(found.angle), np.asarray(found.force), found.slopes
+        fit, np.asarray(resonances.angle), np.asarray(resonances.force), resonances.slopes
     )
     points = [
         point if known else MethodPoint(MethodStatus.NO_RESONANCE, -1)
@@ -92,18 +92,18 @@ def _curves(
 ) -> Float[np.ndarray, "4 amplitude"]:
     """Natural frequency (rad/s), damping ratio, and 1σ of each."""
     flat, rebuild = ravel_pytree(fit.model)
-    constant, by_coefficients = jax.value_and_grad(
+    constant, constant_slopes = jax.value_and_grad(
         lambda coefficients: modal_constant(rebuild(coefficients), fit.mode)
     )(flat)
     ratio = float(constant) * force * hold(angle) / (2 * angle)
-    by_angle, by_force = np.asarray(slopes)
+    angle_slopes, force_slopes = np.asarray(slopes)
     relative = (
-        np.asarray(by_coefficients) / float(constant)
-        + by_force / force[:, None]
-        - by_angle / angle[:, None]
+        np.asarray(constant_slopes) / float(constant)
+        + force_slopes / force[:, None]
+        - angle_slopes / angle[:, None]
     )
     angle_std, relative_std = (
         np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, fit.covariance, slope), 0))
-        for slope in (by_angle, relative)
+        for slope in (angle_slopes, relative)
     )
     return np.stack([angle * fit.rate, ratio, angle_std * fit.rate, relative_std * np.abs(ratio)])

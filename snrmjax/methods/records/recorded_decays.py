@@ -1,4 +1,4 @@
-"""The model's mode in every free decay of a record, apart from its company, or why it is not."""
+"""The mode of interest isolated in every free decay of a record, and the methods for it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -6,8 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from snrmjax.measure.decays.isolated_decay import (
-    MOST_INTERFERING,
-    NOT_KNOWN,
+    MAX_INTERFERING,
+    UNDETERMINED,
     IsolatedDecay,
     isolate_decay,
 )
@@ -27,69 +27,73 @@ def recorded_decays(test: RecordedTest, modes: LinearModes) -> tuple[RecordedDec
     if test.decays:
         return test.decays
     rest = modes.natural_frequency.item(modes.mode_of_interest)
-    found = []
+    decays = []
     for part in test.free:
         try:
-            seen = recorded_velocity(test.recording, test.channels.reference, rest, part)
-            decay = isolate_decay(seen.time, seen.velocity, rest)
+            motion = recorded_velocity(test.recording, test.channels.reference, rest, part)
+            decay = isolate_decay(motion.time, motion.velocity, rest)
         except ValueError as error:
-            # Of a single decay it is the reason why the methods of decays did not run.
+            # For a single decay this is the reason why no decay method ran.
             why = (Fact("decay_left_out", why=str(error)),) if len(test.free) > 1 else ()
-            found.append(RecordedDecay(None, why, str(error)))
+            decays.append(RecordedDecay(None, why, str(error)))
         else:
-            found.append(RecordedDecay(decay, (*decay.notes(), *seen.notes)))
-    return tuple(found)
+            decays.append(RecordedDecay(decay, (*decay.notes(), *motion.notes)))
+    return tuple(decays)
 
 
 def read_decays(
     method: Callable[[IsolatedDecay], MethodResult], decays: tuple[RecordedDecay, ...]
 ) -> list[MethodResult]:
-    """What a method finds in the decays whose mode could be isolated.
+    """A method's results for the decays whose mode could be isolated.
 
-    Raises `ValueError` where none could, and where a
-    method's frequencies lie outside the band of the mode: it follows another motion.
+    Raises `ValueError` where none could, and where a method's frequencies are outside the band of
+    the mode: it follows another motion.
     """
-    found = []
+    results = []
     for one in decays:
         if one.decay is None:
             continue
         result = method(one.decay)
         _require_mode(result, one.decay)
-        found.append(result)
-    if not found:
+        results.append(result)
+    if not results:
         raise ValueError(decays[0].why if decays else "the record has no free decay.")
-    return found
+    return results
 
 
 def restoring_force_of_mode(decay: IsolatedDecay) -> MethodResult:
-    """`restoring_force` of a mode apart from its company.
+    """`restoring_force` of an isolated mode.
 
-    1σ, which the method does not give, is how far its curves are off the decay's own reading, with
-    the 1σ of that. Raises `ValueError` as the method does, and where its forces leave 1 % of the
-    acceleration's power: nothing else is in the record.
+    The method gives no 1σ: it is the deviation of its curves from those of `decay_of_mode`,
+    combined with their 1σ. Raises `ValueError` as the method does, and where the residual exceeds
+    1 % of the acceleration's power, as the record holds only this mode.
     """
-    found = restoring_force(decay.time, decay.velocity, most_left=MOST_INTERFERING)
-    (omega, omega_std), (ratio, ratio_std) = _reading_at(decay, np.asarray(found.velocity))
+    result = restoring_force(decay.time, decay.velocity, most_left=MAX_INTERFERING)
+    (omega, omega_std), (ratio, ratio_std) = _curves_at(decay, np.asarray(result.velocity))
     return dataclasses.replace(
-        found,
-        natural_frequency_std=np.hypot(found.natural_frequency - omega, omega_std),
-        damping_ratio_std=np.hypot(found.damping_ratio - ratio, ratio_std),
+        result,
+        natural_frequency_std=np.hypot(result.natural_frequency - omega, omega_std),
+        damping_ratio_std=np.hypot(result.damping_ratio - ratio, ratio_std),
     )
 
 
 def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
-    """`ssm` of a mode apart from its company.
+    """`ssm` of an isolated mode.
 
-    Its 1σ, which knows white noise, grows as that of the decay's own reading does where company
-    disturbs it, and by the ratio by which the curves are off this reading beyond both (R. T. Birge,
-    Phys. Rev. 40 (1932) 207). Raises `ValueError` as the method does.
+    Its 1σ assumes white noise; it is scaled up as that of `decay_of_mode` is by interfering modes,
+    and by the Birge ratio of the deviation between both methods (R. T. Birge, Phys. Rev. 40 (1932)
+    207). Raises `ValueError` as the method does.
     """
     manifold = fit_submanifold(decay.time, decay.velocity, noise_std=decay.noise_std)
-    found = curves_of_submanifold(manifold)
+    result = curves_of_submanifold(manifold)
     rows = np.argsort(decay.level.real)
-    size = np.asarray(found.velocity)
-    read = decay_of_mode(decay)
-    inside = read.found & (read.velocity >= np.nanmin(size)) & (read.velocity <= np.nanmax(size))
+    velocity = np.asarray(result.velocity)
+    reference = decay_of_mode(decay)
+    inside = (
+        reference.found
+        & (reference.velocity >= np.nanmin(velocity))
+        & (reference.velocity <= np.nanmax(velocity))
+    )
     spread = {}
     for name, excess in (
         ("natural_frequency", decay.excess.imag),
@@ -97,22 +101,24 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
     ):
         value, std, other, other_std = (
             np.asarray(getattr(one, f"{name}{end}"))
-            for one in (found, read)
+            for one in (result, reference)
             for end in ("", "_std")
         )
-        grown = np.interp(np.log(size), decay.level.real[rows], excess[rows])
-        std = std * np.maximum(1.0, grown * decay.noise_std / manifold.slow_std)
+        growth = np.interp(np.log(velocity), decay.level.real[rows], excess[rows])
+        std = std * np.maximum(1.0, growth * decay.noise_std / manifold.slow_std)
         here, here_std = (
-            np.interp(np.asarray(read.velocity)[inside], size[found.found], one[found.found])
+            np.interp(
+                np.asarray(reference.velocity)[inside], velocity[result.found], one[result.found]
+            )
             for one in (value, std)
         )
         away = (other[inside] - here) / np.hypot(other_std[inside], here_std)
         spread[f"{name}_std"] = std * np.sqrt(max(1.0, float(np.mean(away**2))))
-    return dataclasses.replace(found, **spread)
+    return dataclasses.replace(result, **spread)
 
 
-def _reading_at(decay: IsolatedDecay, velocity: np.ndarray) -> list[list[np.ndarray]]:
-    """Frequency and damping with their 1σ as the decay itself is read, at some amplitudes."""
+def _curves_at(decay: IsolatedDecay, velocity: np.ndarray) -> list[list[np.ndarray]]:
+    """Frequency and damping of `decay_of_mode` with their 1σ, at some amplitudes."""
     read = decay_of_mode(decay)
     known, at = np.log(np.asarray(read.velocity)[read.found]), np.log(velocity)
     return [
@@ -127,15 +133,15 @@ def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
     low, high = decay.band
     if omega.size and (omega.min() < low or omega.max() > high):
         raise ValueError(
-            f"what was found, {omega.min() / HERTZ:.4g} to {omega.max() / HERTZ:.4g} Hz, lies "
-            f"outside the mode's own band of {low / HERTZ:.4g} to {high / HERTZ:.4g} Hz: it "
-            "follows another motion."
+            f"the natural frequency, {omega.min() / HERTZ:.4g} to {omega.max() / HERTZ:.4g} Hz, "
+            f"is outside the mode's band of {low / HERTZ:.4g} to {high / HERTZ:.4g} Hz: the "
+            "method follows another motion."
         )
     ratio, std = (
         np.asarray(one)[result.found] for one in (result.damping_ratio, result.damping_ratio_std)
     )
-    if ratio.size and np.nanmedian(std / ratio) > NOT_KNOWN:
+    if ratio.size and np.nanmedian(std / ratio) > UNDETERMINED:
         raise ValueError(
-            f"the 1σ of its damping is {100 * np.nanmedian(std / ratio):.2g} % of the damping "
-            "(median): it does not tell how the mode decays."
+            f"the 1σ of the damping is {100 * np.nanmedian(std / ratio):.2g} % of the damping "
+            "(median): the method does not determine the damping."
         )

@@ -1,15 +1,15 @@
-"""What a time record is: free decay, stepped sine, slow sweep or broadband, by stated rules.
+"""Classify a time record as free decay, stepped sine, slow sweep or broadband, by stated rules.
 
-1. A record without force and drive, or with none that acts, is a free decay if its motion falls
-   from each eighth of the record to the next, from its largest value on.
+1. A record without an acting force or drive is a free decay if, from its largest value on, its
+   motion decreases from each eighth of the record to the next.
 2. Where the drive (else the force) stops for 12 cycles or more, and these stretches are a third
    of the record, they are free decays.
-3. A drive that is one tone with an amplitude that hardly changes from one stretch of 3 to 6 cycles
-   to the next is a stepped sine if steps of 10 cycles or more, within which the frequency moves
-   by less than half of what it does from step to step, cover 30 % of it; and a slow sweep if its
-   frequency moves by 2 % in one direction.
-4. Any other force is broadband; but if the motion falls as in rule 1 the force is noise of its
-   channel, and the record is a free decay.
+3. A drive that is a single tone, with little change of amplitude from one frame of 3 to 6 cycles
+   to the next, is a stepped sine if 30 % of it are steps of 10 cycles or more whose frequency
+   varies by less than half of the change from step to step; and a slow sweep if its frequency
+   changes by 2 % in one direction.
+4. Any other force is broadband; but if the motion decreases as in rule 1 the force is noise of
+   its channel, and the record is a free decay.
 """
 
 from enum import StrEnum
@@ -30,23 +30,23 @@ from snrmjax.numerics.facts import Fact
 _MOTIONS = ("velocity", "acceleration", "displacement")
 _HERTZ = 2 * np.pi
 _PARTS = 8
-_RISE = 0.05  # of the first part's rms, by which the next may be larger: noise, beats
-_FALLEN = 0.95  # of the first part's rms that the last must be below
-_FREE = 1 / 3  # of a record, that stretches without drive hold
+_RISE = 0.05  # of the first part's rms: allowed increase from part to part (noise, beats)
+_DECAYED = 0.95  # of the first part's rms: upper limit of the last
+_FREE = 1 / 3  # least fraction of a record without drive
 _TONE_COVERS = 0.5  # of the record
 _TONE_AMPLITUDE = 0.05  # median change of log amplitude from frame to frame
 _TONE_FREQUENCY = 0.02  # median relative change of frequency
 _STEP_CYCLES = 10
 _STEPS_COVER = 0.3
 _MOVES = 0.5
-_FAR = 2.0  # times the mode's frequency, or one over it: another mode, or wrong times
-_AUDIBLE = 0.01  # of a decay's power near the mode's frequency
+_FAR = 2.0  # ratio to the mode's frequency beyond which it is another mode, or time not in s
+_LEAST_POWER = 0.01  # of a decay's power near the mode's frequency
 _BAND = (0.01, 0.99)  # of the force's power: what a broadband test excites
-_LOOKED_AT = 2**20  # samples whose spectrum is taken
+_MOST_SAMPLES = 2**20  # samples whose spectrum is taken
 
 
 class RecordKind(StrEnum):
-    """What a time record is a record of."""
+    """Kind of test that a time record holds."""
 
     FREE_DECAY = "free decay"
     STEPPED_SINE = "stepped sine"
@@ -55,17 +55,17 @@ class RecordKind(StrEnum):
 
 
 class RecordChannels(NamedTuple):
-    """Channels of a record by their part in a test; motions in the order of `sensors`."""
+    """Channels of a record by their role in the test; motions in the order of `sensors`."""
 
     force: str | None
     drive: str | None
     motions: tuple[str, ...]
     sensors: tuple[str, ...]  # of the model
-    reference: str  # motion at the sensor where the mode moves most
+    reference: str  # motion at the sensor with the largest mode shape component
 
 
 class RecordedDecay(NamedTuple):
-    """The mode alone in one stretch of free decay, or why there is none."""
+    """The isolated mode of one free decay, or why there is none."""
 
     decay: IsolatedDecay | None
     notes: tuple[Fact, ...]
@@ -73,30 +73,30 @@ class RecordedDecay(NamedTuple):
 
 
 class RecordedTest(NamedTuple):
-    """A time record, what it is, and by which rule."""
+    """A time record, its kind, and the rule that decided."""
 
     recording: TimeRecording
     channels: RecordChannels
     kind: RecordKind
-    why: Fact  # by which rule
+    why: Fact  # the rule
     free: tuple[tuple[int, int], ...] = ()  # samples of free decays, start and stop
-    frequency: float = np.nan  # rad/s, strongest of the motion
-    decays: tuple[RecordedDecay, ...] = ()  # of free decays, once they were looked at
+    frequency: float = np.nan  # rad/s, strongest line of the motion
+    decays: tuple[RecordedDecay, ...] = ()  # of free decays, once isolated
 
 
 def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
-    """Sort a time record by what it is; the rules stand at the top of this module.
+    """Classify a time record by the rules of this module.
 
-    Arguments: `recording` has at most one force and at most one voltage that drives, and motions
-    whose channels are named after sensors of `modes` (by `point`, by name or by both); a single
-    motion without such a name is that of the sensor where the mode of interest moves most.
-    Returns a `RecordedTest`. Raises `ValueError` that names the record for channels that do not
-    fit, samples that are not finite, a motion or drive far from the mode's frequency (times that
-    are no seconds, another structure), a single tone, and a record of no known kind.
+    Arguments: `recording` has at most one force, at most one drive voltage, and motions whose
+    channels are named after sensors of `modes` (by `point`, by name or by both); a single motion
+    without such a name belongs to the sensor with the largest mode shape component.
+    Returns a `RecordedTest`. Raises `ValueError`, with the record's name, for unsuitable channels,
+    samples that are not finite, a motion or drive far from the mode's frequency (time not in
+    seconds, another structure), a single tone, and a record of no known kind.
     """
     channels = _channels(recording, modes)
     rest = modes.natural_frequency.item(modes.mode_of_interest)
-    motion = recording.values([channels.reference], 0, _LOOKED_AT)[0]
+    motion = recording.values([channels.reference], 0, _MOST_SAMPLES)[0]
     if not np.isfinite(motion).all():
         raise ValueError(
             f"{recording.name}: channel {channels.reference} has samples that are not finite."
@@ -105,45 +105,45 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
         raise ValueError(f"{recording.name}: channel {channels.reference} does not move.")
     frequency = _strongest(motion, recording.sampling_rate)
     guide = channels.drive or channels.force
-    acting = guide is not None and bool(np.ptp(recording.values([guide], 0, _LOOKED_AT)[0]) > 0)
-    fall = _fall(motion)
+    acting = guide is not None and bool(np.ptp(recording.values([guide], 0, _MOST_SAMPLES)[0]) > 0)
+    fall = _decay_of(motion)
     if guide is None or not acting:
         if fall.decays:
-            frequency = _of_fall(motion, fall, recording.sampling_rate, rest)
+            frequency = _decay_frequency(motion, fall, recording.sampling_rate, rest)
         return _undriven(recording, channels, frequency, rest, fall, len(motion))
     free = _free_stretches(recording, guide, channels.reference)
     if sum(stop - start for start, stop in free) >= _FREE * recording.n_samples:
-        _near_the_mode(recording, frequency, frequency, rest)
+        _require_near_mode(recording, frequency, frequency, rest)
         why = Fact("drive_stops", channel=guide, n=len(free))
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, free, frequency)
     track = _tone(recording, guide)
     if track is not None:
         omega = track.frequency * recording.sampling_rate
-        _near_the_mode(recording, float(omega.min()), float(omega.max()), rest)
-        kind, why = _of_tone(recording, guide, track)
+        _require_near_mode(recording, float(omega.min()), float(omega.max()), rest)
+        kind, why = _tone_kind(recording, guide, track)
         return RecordedTest(recording, channels, kind, why, (), frequency)
     if fall.decays:
         why = Fact("motion_decays_under_noise", channel=guide)
         parts = ((fall.start, len(motion)),)
-        frequency = _of_fall(motion, fall, recording.sampling_rate, rest)
+        frequency = _decay_frequency(motion, fall, recording.sampling_rate, rest)
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, parts, frequency)
-    low, high = _band(recording.values([guide], 0, _LOOKED_AT)[0], recording.sampling_rate)
-    _near_the_mode(recording, low, high, rest)
+    low, high = _band(recording.values([guide], 0, _MOST_SAMPLES)[0], recording.sampling_rate)
+    _require_near_mode(recording, low, high, rest)
     why = Fact("drive_is_no_tone", channel=guide, low_hz=low / _HERTZ, high_hz=high / _HERTZ)
     return RecordedTest(recording, channels, RecordKind.BROADBAND, why, (), frequency)
 
 
 def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
-    """Channels by quantity, and the sensors that they are of."""
+    """Channels by quantity, and their sensors."""
     kept = {
         kind: [channel for channel in recording.channels if channel.quantity == kind]
         for kind in ("force", "voltage")
     }
-    for kind, found in kept.items():
-        if len(found) > 1:
+    for kind, channels in kept.items():
+        if len(channels) > 1:
             raise ValueError(
                 f"{recording.name} has several channels of {kind} "
-                f"({', '.join(each.name for each in found)}): keep the one that drives the mode."
+                f"({', '.join(each.name for each in channels)}): keep the one that drives the mode."
             )
     motions = [channel for channel in recording.channels if channel.quantity in _MOTIONS]
     if not motions:
@@ -155,9 +155,9 @@ def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
     at: dict[str, str] = {}
     for channel in motions:
         for sensor in modes.sensors:
-            place = f"{channel.point}{channel.direction}"
-            names = (channel.point, channel.name, place, f"{channel.name}:{place}")
-            if sensor in names:  # the last as UFF names it
+            point_name = f"{channel.point}{channel.direction}"
+            names = (channel.point, channel.name, point_name, f"{channel.name}:{point_name}")
+            if sensor in names:  # the last is the name in UFF files
                 at.setdefault(sensor, channel.name)
     reference = modes.sensors[reference_sensor(modes)]
     if not at and len(motions) == 1 and not motions[0].point:
@@ -167,27 +167,27 @@ def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
             f"{recording.name} has no motion of the sensor {reference}, where the mode moves most, "
             f"but {', '.join(channel.name for channel in motions)}."
         )
-    force, drive = (found[0].name if found else None for found in kept.values())
+    force, drive = (channels[0].name if channels else None for channels in kept.values())
     return RecordChannels(force, drive, tuple(at.values()), tuple(at), at[reference])
 
 
-class _Fall(NamedTuple):
+class _Decay(NamedTuple):
     start: int  # of the largest value
     decays: bool
     last: float  # rms of the last part over that of the first
 
 
-def _fall(motion: Float[np.ndarray, " sample"]) -> _Fall:
-    """Whether a motion falls from each eighth to the next, from its largest value on."""
+def _decay_of(motion: Float[np.ndarray, " sample"]) -> _Decay:
+    """Whether, from its largest value on, a motion decreases from each eighth to the next."""
     centred = motion - motion.mean()
     start = int(np.argmax(np.abs(centred)))
     length = (len(motion) - start) // _PARTS
     if start > len(motion) // 2 or not length:
-        return _Fall(start, False, 1.0)
+        return _Decay(start, False, 1.0)
     parts = centred[start : start + _PARTS * length].reshape(_PARTS, length)
-    size = np.sqrt(np.mean(parts**2, axis=1))
-    falls = bool(np.all(np.diff(size) < _RISE * size[0])) and bool(size[-1] < _FALLEN * size[0])
-    return _Fall(start, falls, float(size[-1] / size[0]))
+    rms = np.sqrt(np.mean(parts**2, axis=1))
+    falls = bool(np.all(np.diff(rms) < _RISE * rms[0])) and bool(rms[-1] < _DECAYED * rms[0])
+    return _Decay(start, falls, float(rms[-1] / rms[0]))
 
 
 def _undriven(
@@ -195,7 +195,7 @@ def _undriven(
     channels: RecordChannels,
     frequency: float,
     rest: float,
-    fall: _Fall,
+    fall: _Decay,
     count: int,
 ) -> RecordedTest:
     if not fall.decays:
@@ -204,28 +204,28 @@ def _undriven(
             f"(its last eighth has {100 * fall.last:.3g} % of the first): it is neither a free "
             "decay nor a forced test."
         )
-    _near_the_mode(recording, frequency, frequency, rest)
+    _require_near_mode(recording, frequency, frequency, rest)
     why = Fact("motion_falls_undriven")
-    free = ((fall.start, recording.n_samples if count < _LOOKED_AT else count),)
+    free = ((fall.start, recording.n_samples if count < _MOST_SAMPLES else count),)
     return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, free, frequency)
 
 
 def _free_stretches(
     recording: TimeRecording, guide: str, motion: str
 ) -> tuple[tuple[int, int], ...]:
-    """Stretches without drive, a cycle after it has stopped; none where it never stops."""
+    """Stretches without drive, from one cycle after its stop on; none where it never stops."""
     try:
-        found = find_ring_downs(recording, guide, motion)
-    except ValueError:  # the drive never stops: its only other reasons were looked at before
+        ring_downs = find_ring_downs(recording, guide, motion)
+    except ValueError:  # the drive never stops; other causes were excluded before
         return ()
     return tuple(
         (free.start + int(np.ceil(_HERTZ * recording.sampling_rate / free.frequency)), free.stop)
-        for free in found
+        for free in ring_downs
     )
 
 
 def _tone(recording: TimeRecording, guide: str) -> ToneTrack | None:
-    """The track of a drive that is one slowly changing tone, or None."""
+    """The track of a drive that is one slowly varying tone, or None."""
     try:
         track = track_tone(recording, guide)
     except ValueError:  # no frame holds a tone
@@ -237,7 +237,7 @@ def _tone(recording: TimeRecording, guide: str) -> ToneTrack | None:
     return track if amplitude < _TONE_AMPLITUDE and frequency < _TONE_FREQUENCY else None
 
 
-def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[RecordKind, Fact]:
+def _tone_kind(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[RecordKind, Fact]:
     rate = recording.sampling_rate
     steps = [
         step
@@ -253,7 +253,7 @@ def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[Re
         return RecordKind.SLOW_SWEEP, Fact("tone_that_moves", channel=guide, n=len(runs))
     raise ValueError(
         f"{recording.name}: {guide} is a single tone of "
-        f"{np.median(track.frequency) * rate / _HERTZ:.5g} Hz, of which no method makes a backbone."
+        f"{np.median(track.frequency) * rate / _HERTZ:.5g} Hz, which gives no backbone."
     )
 
 
@@ -268,17 +268,19 @@ def _strongest(motion: Float[np.ndarray, " sample"], rate: float) -> float:
     return float(omega[1 + int(np.argmax(power[1:]))])
 
 
-def _of_fall(motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float, rest: float) -> float:
-    """Strongest frequency of a decay, in rad/s: its beginning, where it is largest, counts most.
+def _decay_frequency(
+    motion: Float[np.ndarray, " sample"], fall: _Decay, rate: float, rest: float
+) -> float:
+    """Strongest frequency of a decay, in rad/s; its start, where it is largest, weighs most.
 
-    Near the mode's where 1 % of the power is: another mode may be louder.
+    Searched near the mode's frequency if 1 % of the power is there: another mode may be larger.
     """
-    falling = motion[fall.start :] - motion.mean()
-    window = np.hanning(2 * len(falling))[len(falling) :]
-    power = np.abs(np.fft.rfft(falling * window)) ** 2
-    omega = _HERTZ * np.fft.rfftfreq(len(falling), 1 / rate)
+    decaying = motion[fall.start :] - motion.mean()
+    window = np.hanning(2 * len(decaying))[len(decaying) :]
+    power = np.abs(np.fft.rfft(decaying * window)) ** 2
+    omega = _HERTZ * np.fft.rfftfreq(len(decaying), 1 / rate)
     near = (omega > rest / _FAR) & (omega < rest * _FAR)
-    if power[near].sum() > _AUDIBLE * power[1:].sum():
+    if power[near].sum() > _LEAST_POWER * power[1:].sum():
         power = np.where(near, power, 0.0)
     return float(omega[1 + int(np.argmax(power[1:]))])
 
@@ -290,7 +292,7 @@ def _band(force: Float[np.ndarray, " sample"], rate: float) -> tuple[float, floa
     return low, high
 
 
-def _near_the_mode(recording: TimeRecording, low: float, high: float, rest: float) -> None:
+def _require_near_mode(recording: TimeRecording, low: float, high: float, rest: float) -> None:
     if low / _FAR <= rest <= high * _FAR:
         return
     where = f"{low / _HERTZ:.4g}" if high == low else f"{low / _HERTZ:.4g} to {high / _HERTZ:.4g}"

@@ -1,4 +1,4 @@
-"""The velocity of a record's motion, whatever was measured."""
+"""Velocity of a record from a measured velocity, acceleration or displacement."""
 
 from typing import NamedTuple
 
@@ -11,9 +11,9 @@ from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
 
 _HERTZ = 2 * np.pi
-_CORNER = 0.25  # of the motion's frequency: what is slower is drift of an integrated signal
+_CORNER = 0.25  # of the motion's frequency: below it an integrated signal is drift
 _ORDER = 4  # at the motion's frequency the filter is then 1 within 2e-5
-_ENDS = 8.0  # cycles at both ends in which it has not settled
+_ENDS = 8.0  # cycles at both ends until it has settled
 _SPLINE = 5
 
 
@@ -35,9 +35,9 @@ def recorded_velocity(
     """The velocity of a motion over `part` of a record.
 
     Arguments: `name` of a channel of velocity, acceleration or displacement; `frequency` of the
-    motion (rad/s); `part` in samples. Accelerations are integrated and displacements derived by a
-    spline of degree 5; of an integral what is slower than a quarter of the frequency is drift and
-    is filtered out forwards and backwards, and the filter's ends, eight cycles, are left out.
+    motion (rad/s); `part` in samples. Accelerations are integrated and displacements
+    differentiated by a spline of degree 5; drift of an integral, below a quarter of the frequency,
+    is removed by a zero-phase high-pass, whose ends of eight cycles are left out.
     Returns a `RecordedVelocity`. Raises `ValueError` as `even_record` does (a clipped record, one
     that is not finite).
     """

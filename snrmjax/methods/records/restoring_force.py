@@ -1,10 +1,10 @@
-"""Restoring-force surface of one mode: what force a motion meets, over displacement and velocity.
+"""Restoring-force surface of one mode: elastic force over displacement, damping over velocity.
 
 A mode obeys ẍ + s(x) + d(v) = |Φ_r Φᵀb| F. Acceleration and displacement follow from the measured
-velocity, and two polynomials are fitted to what is left of every sample: an elastic force over
+velocity, and two functions are fitted to the inertia force of every sample: an elastic force over
 displacement and a damping force over velocity, both per unit of modal mass at the sensor. The
-motions of the elastic force alone, between two displacements of one potential energy, then give the
-natural frequency at each amplitude, and what the damping force takes of them the damping.
+undamped motions, between two displacements of equal potential energy, then give the natural
+frequency at each amplitude, and the power dissipated along them gives the damping.
 
 References: S. F. Masri & T. K. Caughey, J. Appl. Mech. 46 (1979) 433, doi:10.1115/1.3424568;
 G. Kerschen, K. Worden, A. F. Vakakis & J. C. Golinval, Mech. Syst. Signal Process. 20 (2006) 505,
@@ -22,15 +22,15 @@ from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, meth
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
 
-_POINTS = 25  # amplitudes at which the fitted surface is asked
+_POINTS = 25  # amplitudes at which the fitted surface is evaluated
 _ANGLES = 128  # of half a cycle
 _SPLINE = 5  # degree: velocity, its derivative and its integral from one curve
-_ENDS = 2.0  # cycles at each end that the curve's derivative is not trusted in
+_ENDS = 2.0  # cycles at each end where the spline's derivative is not used
 _MOST = 9
-_SHIFTS = 4  # rounds in which the displacement's middle and drift are found
+_SHIFTS = 4  # iterations for the displacement's zero and drift
 _BISECTIONS = 60
-_ROUNDS = 8  # of the displacement that has a wanted velocity
-_FAR = 4.0  # times it, within which the motion turns on the other side
+_ROUNDS = 8  # iterations for the displacement of a given velocity
+_FAR = 4.0  # times it: search range of the turning point on the other side
 
 
 class RestoringForce(NamedTuple):
@@ -40,7 +40,7 @@ class RestoringForce(NamedTuple):
     damping: Float[np.ndarray, "3"]  # d(v) = c₁ v + c₂ v|v| + c₃ v³
     smallest: float  # m/s, velocity amplitude of the record's smallest cycle used
     largest: float
-    misfit: float  # rms of what the two forces leave, over the rms of the acceleration
+    misfit: float  # rms residual over the rms of the acceleration
 
     def damping_force(self, velocity: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """d(v) in m/s²."""
@@ -60,21 +60,21 @@ def fit_restoring_force(
     """Fit elastic and damping force to a record of one mode, free or forced.
 
     Arguments: `time` in s, evenly spaced; `velocity` in m/s; `force` in N, where one acts, with the
-    `modes` that say what it does to the mode of interest (|Φ_r Φᵀb|); `degree` of the elastic
-    force. A free decay is read down to `least_amplitude` (m/s); `most_left` is the share of the
-    acceleration's power that the forces may leave.
+    `modes` that give its modal constant |Φ_r Φᵀb|; `degree` of the elastic force. A free decay is
+    used down to `least_amplitude` (m/s); `most_left` is the largest residual as a fraction of the
+    acceleration's power.
     Returns a `RestoringForce`. Raises `ValueError` for a record as in `resonant_decay`, for a force
-    without modes, for a degree outside 1 to 9, and for forces that leave more than `most_left`.
+    without modes, for a degree outside 1 to 9, and for a residual above `most_left`.
     Validity: one mode in the record (`isolate_decay` before), an elastic force of displacement
-    alone and a damping force of velocity alone. Where the integrated displacement has its zero,
-    and what an offset of the velocity makes of it, is fitted: the elastic force is zero at rest.
+    alone and a damping force of velocity alone. Zero and drift of the integrated displacement are
+    fitted, such that the elastic force is zero at rest.
     """
     from scipy.interpolate import make_interp_spline
 
     if not 1 <= degree <= _MOST:
         raise ValueError(f"`degree` must be from 1 to {_MOST}, but is {degree}.")
     if force is not None and modes is None:
-        raise ValueError("`modes` are needed with a force: they say what it drives.")
+        raise ValueError("`modes` are needed with a force: they give its modal constant.")
     times, speed = checked_record(time, velocity)
     curve = make_interp_spline(times, speed, k=_SPLINE)
     acceleration = curve.derivative()(times)
@@ -82,12 +82,12 @@ def fit_restoring_force(
     displacement = displacement - np.polyval(np.polyfit(times, displacement, 1), times)
     if force is not None and modes is not None:
         acceleration = acceleration - drive_point(modes) * _of_length(force, len(times))
-    at, size = velocity_extremes(times, speed)
+    at, peaks = velocity_extremes(times, speed)
     cycle = 2 * float(np.median(np.diff(at)))
-    above = size >= least_amplitude
+    above = peaks >= least_amplitude
     end = at[-1] if above.all() else at[int(np.argmin(above))]
     inside = (times > times[0] + _ENDS * cycle) & (times < min(end, times[-1] - _ENDS * cycle))
-    used = size[(at > times[0] + _ENDS * cycle) & (at < min(end, times[-1] - _ENDS * cycle))]
+    used = peaks[(at > times[0] + _ENDS * cycle) & (at < min(end, times[-1] - _ENDS * cycle))]
     moved, away = displacement[inside], (times[inside] - times[inside].mean()) / cycle
     for _ in range(_SHIFTS):
         terms = [moved**power for power in range(1, degree + 1)]
@@ -95,19 +95,24 @@ def fit_restoring_force(
         design = np.stack([*terms, *_damping_terms(speed[inside]), *shifts], axis=1)
         scale = np.sqrt(np.mean(design**2, axis=0))
         solved, *_ = np.linalg.lstsq(design / scale, -acceleration[inside], rcond=None)
-        found = solved / scale
-        if not found[0] > 0:
+        coefficients = solved / scale
+        if not coefficients[0] > 0:
             break
-        moved = moved + (found[-2] + found[-1] * away) / found[0]
+        moved = moved + (coefficients[-2] + coefficients[-1] * away) / coefficients[0]
     left = design / scale @ solved + acceleration[inside]
     misfit = float(np.sqrt(np.mean(left**2) / np.mean(acceleration[inside] ** 2)))
     if misfit**2 > most_left:
         raise ValueError(
-            f"the two forces leave {100 * misfit**2:.2g} % of the acceleration's power: they are "
-            "not those of one mode (isolate it before, `isolate_decay`), or of another form."
+            f"the residual of the two forces is {100 * misfit**2:.2g} % of the acceleration's "
+            "power: the record has several modes (use `isolate_decay` before), or forces of "
+            "another form."
         )
     return RestoringForce(
-        found[:degree], found[degree : degree + 3], float(used.min()), float(used.max()), misfit
+        coefficients[:degree],
+        coefficients[degree : degree + 3],
+        float(used.min()),
+        float(used.max()),
+        misfit,
     )
 
 
@@ -123,11 +128,11 @@ def restoring_force(
 ) -> MethodResult:
     """Natural frequency and damping that the fitted forces imply, over the record's amplitudes.
 
-    A motion of the elastic force alone has the period T = ∮ dx / v with ½v² = ∫ s dx between its
-    ends, and a fundamental velocity V; 2ζ̃ω̃ = ∮ d(v) v dt / (½ V² T), the mean power lost.
+    An undamped motion has the period T = ∮ dx / v with ½v² = ∫ s dx between its ends, and the
+    fundamental velocity V; 2ζ̃ω̃ = ∮ d(v) v dt / (½ V² T), the mean dissipated power.
 
     Arguments and errors as in `fit_restoring_force`. Returns a `MethodResult` of 25 amplitudes,
-    without 1σ, which the method does not give; its note has the misfit.
+    without 1σ, which the method does not give; its note states the misfit.
     """
     fitted = fit_restoring_force(
         *(time, velocity, force, modes),
@@ -157,37 +162,37 @@ _ANGLE = np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES  # of half a cycle
 
 
 class _Cycle(NamedTuple):
-    """A motion of the elastic force alone."""
+    """An undamped motion."""
 
     natural: float  # rad/s
     velocity: float  # m/s, fundamental
-    lost: float  # 2ζ̃ω̃, 1/s
+    dissipation: float  # 2ζ̃ω̃, 1/s
 
 
 def _points(fitted: RestoringForce) -> list[MethodPoint]:
-    """Amplitudes that span those of the record."""
+    """Points that span the amplitudes of the record."""
     rest = np.sqrt(max(fitted.elastic[0], np.finfo(float).tiny))
-    found = []
+    points = []
     for wanted in np.linspace(fitted.smallest, fitted.largest, _POINTS):
-        size, cycle = wanted / rest, None
-        for _ in range(_ROUNDS):  # the fundamental velocity is nearly in proportion to the size
-            cycle = _cycle(fitted, size)
+        displacement, cycle = wanted / rest, None
+        for _ in range(_ROUNDS):  # the fundamental velocity is nearly proportional to it
+            cycle = _cycle(fitted, displacement)
             if cycle is None:
                 break
-            size *= wanted / cycle.velocity
-        if cycle is None or not cycle.lost > 0:
-            found.append(MethodPoint(MethodStatus.NOT_A_MODE, -1))
+            displacement *= wanted / cycle.velocity
+        if cycle is None or not cycle.dissipation > 0:
+            points.append(MethodPoint(MethodStatus.NOT_A_MODE, -1))
             continue
-        found.append(
+        points.append(
             MethodPoint(
                 MethodStatus.FOUND,
                 -1,
                 velocity=cycle.velocity,
                 natural_frequency=cycle.natural,
-                damping_ratio=cycle.lost / (2 * cycle.natural),
+                damping_ratio=cycle.dissipation / (2 * cycle.natural),
             )
         )
-    return found
+    return points
 
 
 def _energy(fitted: RestoringForce, displacement: np.ndarray) -> np.ndarray:
@@ -196,10 +201,10 @@ def _energy(fitted: RestoringForce, displacement: np.ndarray) -> np.ndarray:
     return np.sum(fitted.elastic / powers * displacement[..., None] ** powers, axis=-1)
 
 
-def _cycle(fitted: RestoringForce, size: float) -> _Cycle | None:
-    """The motion from a displacement on; None where nothing turns it back."""
-    top = _energy(fitted, np.array(size))
-    grid = -size * np.linspace(0, _FAR, _ANGLES)
+def _cycle(fitted: RestoringForce, displacement: float) -> _Cycle | None:
+    """The motion that starts at a displacement; None where it has no second turning point."""
+    top = _energy(fitted, np.array(displacement))
+    grid = -displacement * np.linspace(0, _FAR, _ANGLES)
     above = _energy(fitted, grid) >= top
     if not above.any():
         return None
@@ -208,13 +213,13 @@ def _cycle(fitted: RestoringForce, size: float) -> _Cycle | None:
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
         low, high = (middle, high) if _energy(fitted, middle) >= top else (low, middle)
-    centre, radius = (size + low) / 2, (size - low) / 2
+    centre, radius = (displacement + low) / 2, (displacement - low) / 2
     x = centre + radius * np.cos(_ANGLE)
     square = 2 * (top - _energy(fitted, x))
     if not np.all(square > 0):
         return None
     speed = np.sqrt(square)
-    # Time per angle is smooth; its cosine series integrates it exactly.
+    # With x = centre + radius cos φ, dt/dφ is smooth, and its cosine series is integrated.
     by_angle = radius * np.sin(_ANGLE) / speed
     period = 2 * np.pi * float(by_angle.mean())
     order = np.arange(1, _ANGLES // 2)

@@ -1,13 +1,13 @@
 """Spectral submanifold of one mode from a free decay: embedding, manifold, normal form, backbone.
 
-Delays of one velocity span a space in which the decaying motion lies on a two-dimensional
-invariant manifold, the spectral submanifold of the slowest mode. Its tangent plane comes from
-singular values, the manifold over the plane is a polynomial (how far the record is off it is
-reported), and the linear map in the plane gives the complex coordinate from which the polynomial
-normal form starts. The normal form's coefficients are then those whose *trajectory* fits the
-record best: all of it at once, without a derivative of the data, so that white noise gives
-honest standard deviations. (Cenedese et al. minimise the error of the reduced vector field
-instead; manifold, reduced dynamics and normal form are the same, their code is not used.)
+In the delay embedding of one velocity the decaying motion lies on a two-dimensional invariant
+manifold, the spectral submanifold of the slowest mode. Its tangent plane is from a singular value
+decomposition, the manifold is a polynomial over the plane (its misfit is reported), and the linear
+map in the plane gives the complex coordinate from which the polynomial normal form starts. The
+normal form's coefficients are then those whose *trajectory* fits the whole record best, without a
+derivative of the data, so that standard deviations are right for white noise. (Cenedese et al.
+minimise the error of the reduced vector field instead; manifold, reduced dynamics and normal form
+are the same, their code is not used.)
 
 References: M. Cenedese, J. Axås, B. Bäuerlein, K. Avila & G. Haller, Nat. Commun. 13 (2022) 872,
 doi:10.1038/s41467-022-28518-y; G. Haller & S. Ponsioen, Nonlinear Dyn. 86 (2016) 1493,
@@ -22,7 +22,7 @@ from numpy.polynomial import chebyshev
 from scipy.signal import decimate
 
 from snrmjax.measure.decays.decay_record import even_record, require_cycles
-from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
+from snrmjax.methods.records.normal_form import NormalForm, form_of, sensor_signal, unknowns_of
 from snrmjax.methods.result import MethodResult, method_result, points_of_curves
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
@@ -31,29 +31,29 @@ _DELAYS = 5  # 2·2 + 1: enough for a plane, by Takens' theorem
 _FEWEST_SAMPLES = 8  # a cycle
 _MOST_TERMS = 7  # of α and ω: polynomials of degree 13 in ρ e^{iθ}
 _ORDERS = (2, 3, 4, 5)  # harmonics in the record
-_START = 0.1  # of the largest amplitude: what the start is fitted to
+_START = 0.1  # of the largest amplitude: least amplitude in the fit of the start
 _MOST_SAMPLES = 2**18
-_ROUNDS = 4  # of fits whose unit is the misfit of the one before
-_SAME = 0.7  # of the misfit before: a round that lowers it less is the last
+_ROUNDS = 4  # fits, each scaled by the misfit of the one before
+_SAME = 0.7  # ratio of successive misfits above which the fits end
 _RULE = StepRule(steps=25, settled=0.1)
 _POINTS = 25
 _MANIFOLD_DEGREE = 5
-_BESIDE = 4  # lines a term, each side of the mode, whose residual counts for the bands
-_MOST_LEFT = 0.25  # of a record's power, which one mode does not leave
-_STEP = 1e-4  # of an unknown's own 1σ and size, for derivatives of the curves
+_NEIGHBOURS = 4  # lines per term, on each side of the mode, whose residual enters the bands
+_MOST_LEFT = 0.25  # largest residual of one mode as a fraction of the record's power
+_STEP = 1e-4  # of an unknown's 1σ or magnitude, for finite differences of the curves
 
 
 class SpectralSubmanifold(NamedTuple):
-    """What a decay says of its mode."""
+    """Normal form of a decay with its errors and checks."""
 
     form: NormalForm
     covariance: Float[np.ndarray, "unknown unknown"]  # of the unknowns of the form
     smallest: float  # m/s, fundamental velocity amplitude
     largest: float
-    noise_std: float  # m/s, of a sample: what the trajectory leaves
-    slow_std: float  # m/s, of white noise as dense as what it leaves beside the mode
-    manifold_misfit: float  # rms off the manifold over rms of the embedded record
-    left: float  # share of the record's power that the trajectory leaves
+    noise_std: float  # m/s, of a sample: rms residual of the trajectory
+    slow_std: float  # m/s, of white noise with the residual's density near the mode
+    manifold_misfit: float  # rms distance from the manifold over rms of the embedded record
+    left: float  # residual as a fraction of the record's power
     samples: int
 
 
@@ -62,11 +62,11 @@ class _Fit(NamedTuple):
 
     form: NormalForm
     minimum: "Minimum[_Trial]"
-    mean_square: float  # of what it leaves, (m/s)²
+    mean_square: float  # of the residual, (m/s)²
 
 
 class _Trial(NamedTuple):
-    """The trajectory fit linearised at one point, in units of the misfit's size."""
+    """The trajectory fit linearised at one point, in units of the rms misfit."""
 
     residuals: Float[np.ndarray, " sample"]
     jacobian: Float[np.ndarray, "sample unknown"]
@@ -83,12 +83,12 @@ def ssm(
     """Natural frequency and damping against amplitude from the normal form on a decay's manifold.
 
     The natural frequency is √(ω² + α²) of the decaying motion's ω(ρ) and α(ρ); the damping is the
-    power lost over ½ m V², as at phase resonance (`NormalForm.modal_damping`).
+    dissipated power over ½ m V², as at phase resonance (`NormalForm.modal_damping`).
 
-    Arguments and errors as in `fit_submanifold`, and `ValueError` where a decaying mode leaves a
-    quarter of the record's power. Returns a `MethodResult` of 25 amplitudes whose
-    velocity is the fundamental's; 1σ from the fit's residual near the mode's frequency. An
-    amplitude at which the mode gains energy is `NOT_A_MODE`.
+    Arguments and errors as in `fit_submanifold`, and `ValueError` where the residual exceeds a
+    quarter of the record's power. Returns a `MethodResult` of 25 amplitudes, whose velocity is
+    that of the fundamental; 1σ from the fit's residual near the mode's frequency. An amplitude at
+    which the mode gains energy is `NOT_A_MODE`.
     """
     return curves_of_submanifold(
         fit_submanifold(
@@ -97,21 +97,21 @@ def ssm(
     )
 
 
-def curves_of_submanifold(found: SpectralSubmanifold) -> MethodResult:
+def curves_of_submanifold(manifold: SpectralSubmanifold) -> MethodResult:
     """Natural frequency and damping of a submanifold at 25 amplitudes; errors as in `ssm`."""
-    amplitude = np.linspace(found.smallest, found.largest, _POINTS)
-    values = _curves(found.form, amplitude)
-    if found.left > _MOST_LEFT and np.any(values[1] > 0):
+    amplitude = np.linspace(manifold.smallest, manifold.largest, _POINTS)
+    values = _curves(manifold.form, amplitude)
+    if manifold.left > _MOST_LEFT and np.any(values[1] > 0):
         raise ValueError(
-            f"one decaying mode leaves {100 * found.left:.2g} % of the record's power: other "
-            "motion lies beside it; isolate the mode before (`isolate_decay`)."
+            f"the residual of one decaying mode is {100 * manifold.left:.2g} % of the record's "
+            "power: the record has interfering modes; isolate the mode before (`isolate_decay`)."
         )
-    spread = _curve_std(found, amplitude)
-    points = points_of_curves(amplitude, values[0], spread[0], values[1], spread[1])
-    degree = 2 * len(found.form.decay) - 1
+    std = _curve_std(manifold, amplitude)
+    points = points_of_curves(amplitude, values[0], std[0], values[1], std[1])
+    degree = 2 * len(manifold.form.decay) - 1
     notes = (
-        Fact("normal_form_fitted", degree=degree, noise_std=found.noise_std),
-        Fact("off_the_manifold", misfit=found.manifold_misfit),
+        Fact("normal_form_fitted", degree=degree, noise_std=manifold.noise_std),
+        Fact("off_the_manifold", misfit=manifold.manifold_misfit),
     )
     return method_result("ssm", points, 0, notes)
 
@@ -126,15 +126,14 @@ def fit_submanifold(
 ) -> SpectralSubmanifold:
     """The spectral submanifold and its normal form from one velocity in free decay.
 
-    Arguments: `time` in s, evenly spaced; `velocity` in m/s, from the moment on at which the
-    force was gone; `terms` of the polynomials α and ω in ρ² (1 for a linear mode), from 1 to 7,
-    by default one more than Schwarz' criterion asks for; the record is read down to
-    `least_amplitude` (m/s); `noise_std` (m/s) of white noise as dense as that near the mode, where
-    a filter took the rest of it away.
+    Arguments: `time` in s, evenly spaced; `velocity` in m/s, from the removal of the force on;
+    `terms` of the polynomials α and ω in ρ² (1 for a linear mode), from 1 to 7, by default one
+    more than Schwarz' criterion selects; the record is used down to `least_amplitude` (m/s);
+    `noise_std` (m/s) of white noise with the density near the mode, for a filtered record.
     Returns a `SpectralSubmanifold`. Raises `ValueError` for a record as in `resonant_decay` and
     where the record holds no decaying oscillation.
-    Validity: one mode (isolate it before, `isolate_decay`), smooth forces: dry friction is
-    no polynomial, and 1σ does not know of it.
+    Validity: one mode (isolate it before, `isolate_decay`), smooth forces: dry friction is not
+    polynomial, and 1σ does not include its model error.
     """
     if terms is not None and not 1 <= terms <= _MOST_TERMS:
         raise ValueError(f"`terms` must be from 1 to {_MOST_TERMS}, but is {terms}.")
@@ -152,9 +151,9 @@ def fit_submanifold(
         )
     lag = max(1, round(1 / (_DELAYS * hertz * step)))
     coordinate, misfit = _on_the_plane(signal - signal.mean(), lag)
-    size = np.abs(coordinate)
-    below = np.flatnonzero(size < max(least_amplitude, 0.0))
-    end = below[0] if below.size else len(size)
+    amplitude = np.abs(coordinate)
+    below = np.flatnonzero(amplitude < max(least_amplitude, 0.0))
+    end = below[0] if below.size else len(amplitude)
     require_cycles(signal[:end], end * step * hertz)
     times, signal, coordinate = times[:end], signal[:end], coordinate[:end]
     per_cycle = 1 / (hertz * step)
@@ -166,7 +165,7 @@ def fit_submanifold(
 
 
 def _main_frequency(signal: np.ndarray, step: float) -> float:
-    """Frequency in Hz of the record's largest spectral line, its mean left out."""
+    """Frequency in Hz of the record's largest spectral line, without the mean."""
     spectrum = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(len(signal))))
     return max(1, int(np.argmax(spectrum))) / (len(signal) * step)
 
@@ -174,7 +173,7 @@ def _main_frequency(signal: np.ndarray, step: float) -> float:
 def _on_the_plane(signal: np.ndarray, lag: int) -> tuple[Complex[np.ndarray, " k"], float]:
     """Complex coordinate of the decay in the manifold's tangent plane, and the manifold's misfit.
 
-    The coordinate's modulus is about the fundamental amplitude, its angle rises.
+    The coordinate's modulus is close to the fundamental amplitude, its angle increases.
     """
     count = len(signal) - (_DELAYS - 1) * lag
     delays = np.stack([signal[j * lag : j * lag + count] for j in range(_DELAYS)])
@@ -185,14 +184,14 @@ def _on_the_plane(signal: np.ndarray, lag: int) -> tuple[Complex[np.ndarray, " k
     k = int(np.argmax(multipliers.imag))
     if not multipliers[k].imag > 0:
         raise ValueError("the record holds no oscillation in its plane of largest motion.")
-    turning = left[:, k] @ plane
-    design = np.stack([turning.real, -turning.imag], axis=1)
+    rotating = left[:, k] @ plane
+    design = np.stack([rotating.real, -rotating.imag], axis=1)
     real, imaginary = np.linalg.lstsq(design, signal[:count], rcond=None)[0]
-    return (real + 1j * imaginary) * turning, _off_the_manifold(delays, directions, plane)
+    return (real + 1j * imaginary) * rotating, _off_the_manifold(delays, directions, plane)
 
 
 def _off_the_manifold(delays: np.ndarray, directions: np.ndarray, plane: np.ndarray) -> float:
-    """How far the embedded record is off a polynomial over the plane, relative to its size."""
+    """rms distance of the embedded record from a polynomial over the plane, relative to its rms."""
     x, y = plane / np.abs(plane).max()
     powers = [(a, d - a) for d in range(1, _MANIFOLD_DEGREE + 1) for a in range(d + 1)]
     design = np.stack([x**a * y**b for a, b in powers], axis=1)
@@ -209,10 +208,10 @@ def _selected(
     wanted: int | None,
     noise_std: float,
 ) -> _Fit | None:
-    """The fit of as many terms as wanted, or one term more than Schwarz' criterion asks for.
+    """The fit with the wanted number of terms, or one more than Schwarz' criterion selects.
 
-    What the terms left out would bend the curves is then small beside the bands; with the
-    criterion's own choice it is not, and the bands are too narrow.
+    The truncation error is then small compared with the bands; with the criterion's own choice it
+    is not, and the bands are too narrow.
     """
     n, best, least = len(times), None, np.inf
     starts: list[NormalForm] = []
@@ -232,7 +231,7 @@ def _selected(
 
 
 def _with_terms(form: NormalForm, terms: int) -> NormalForm:
-    """The same normal form with room for more terms."""
+    """The same normal form, padded with zero terms."""
     more = (0, terms - len(form.decay))
     return form._replace(decay=np.pad(form.decay, more), frequency=np.pad(form.frequency, more))
 
@@ -240,19 +239,19 @@ def _with_terms(form: NormalForm, terms: int) -> NormalForm:
 def _started(
     times: np.ndarray, coordinate: np.ndarray, orders: tuple[int, ...], terms: int
 ) -> NormalForm:
-    """A normal form from integrals along the decay: no derivative of the data is taken."""
-    size, phase = np.abs(coordinate), np.unwrap(np.angle(coordinate))
-    scale = float(np.quantile(size[: max(8, len(size) // 50)], 0.9))
-    below = np.flatnonzero(size < _START * scale)
+    """Start values from integrals along the decay, without derivatives of the data."""
+    amplitude, phase = np.abs(coordinate), np.unwrap(np.angle(coordinate))
+    scale = float(np.quantile(amplitude[: max(8, len(amplitude) // 50)], 0.9))
+    below = np.flatnonzero(amplitude < _START * scale)
     part = slice(0, below[0] if below.size else None)
-    size, phase, at = size[part], phase[part], times[: len(coordinate)][part]
-    ratio = size / scale
+    amplitude, phase, at = amplitude[part], phase[part], times[: len(coordinate)][part]
+    ratio = amplitude / scale
     steps = np.diff(at)[:, None]
     powers = chebyshev.chebvander(2 * ratio**2 - 1, terms - 1)
-    grown = np.concatenate(
+    integrals = np.concatenate(
         [np.zeros((1, terms)), np.cumsum((powers[1:] + powers[:-1]) / 2 * steps, axis=0)]
     )
-    design = np.concatenate([np.ones((len(at), 1)), grown], axis=1) * ratio[:, None]
+    design = np.concatenate([np.ones((len(at), 1)), integrals], axis=1) * ratio[:, None]
     length = np.linalg.norm(design, axis=0)
     target = np.stack([np.log(ratio), phase], axis=1) * ratio[:, None]
     solved = np.linalg.lstsq(design / length, target, rcond=None)[0] / length[:, None]
@@ -261,7 +260,7 @@ def _started(
 
 
 def _fitted(times: np.ndarray, signal: np.ndarray, starts: list[NormalForm]) -> _Fit | None:
-    """The trajectory that fits best from the best of some starts, or None where there is none."""
+    """The best trajectory fit from the best start, or None where no start can be integrated."""
     squares = [float(np.mean(_trial(form, times, signal, 1.0).residuals ** 2)) for form in starts]
     if not np.isfinite(squares).any():
         return None
@@ -289,11 +288,11 @@ def _fitted(times: np.ndarray, signal: np.ndarray, starts: list[NormalForm]) -> 
 
 def _trial(form: NormalForm, times: np.ndarray, signal: np.ndarray, unit: float) -> _Trial:
     try:
-        found = seen(form, times)
+        trajectory = sensor_signal(form, times)
     except ArithmeticError:
         unknown = len(unknowns_of(form))
         return _Trial(np.full(len(times), np.nan), np.zeros((len(times), unknown)))
-    return _Trial((found.signal - signal) / unit, found.jacobian / unit)
+    return _Trial((trajectory.signal - signal) / unit, trajectory.jacobian / unit)
 
 
 def _submanifold(
@@ -304,26 +303,28 @@ def _submanifold(
     noise_std: float,
 ) -> SpectralSubmanifold:
     form = best.form
-    found = seen(form, times)
-    left = signal - found.signal
+    trajectory = sensor_signal(form, times)
+    left = signal - trajectory.signal
     free = len(times) - len(best.minimum.point)
     variance = float(left @ left) / free
-    # Of coloured residuals only what turns with the mode, or slowly beside it, moves its curves.
-    lines = _BESIDE * len(form.decay)
-    density = np.abs(np.fft.fft(left * np.exp(-1j * found.phase))) ** 2 / len(left)
+    # Of coloured residuals only the part near the rotating mode's frequency affects its curves.
+    lines = _NEIGHBOURS * len(form.decay)
+    density = np.abs(np.fft.fft(left * np.exp(-1j * trajectory.phase))) ** 2 / len(left)
     near = np.concatenate([density[: lines + 1], density[-lines:]])
     coloured = float(near.sum()) / (len(near) - 1 - len(form.decay))
     slow = float(np.sqrt(max(variance, coloured, noise_std**2)))
-    size = np.linalg.norm(found.jacobian, axis=0)
-    inverse = np.linalg.pinv((found.jacobian / size).T @ (found.jacobian / size), hermitian=True)
+    norms = np.linalg.norm(trajectory.jacobian, axis=0)
+    inverse = np.linalg.pinv(
+        (trajectory.jacobian / norms).T @ (trajectory.jacobian / norms), hermitian=True
+    )
     noise = float(np.sqrt(variance))
-    # A cycle says no more of its own fall.
-    first = int(np.searchsorted(found.phase - found.phase[0], 2 * np.pi))
+    # The first cycle does not determine the decay at its own amplitude.
+    first = int(np.searchsorted(trajectory.phase - trajectory.phase[0], 2 * np.pi))
     return SpectralSubmanifold(
         form,
-        slow**2 * inverse / np.outer(size, size),
-        float(max(found.amplitude.min(), min(noise, 0.1 * found.amplitude.max()))),
-        float(found.amplitude[min(first, len(times) - 1) :].max()),
+        slow**2 * inverse / np.outer(norms, norms),
+        float(max(trajectory.amplitude.min(), min(noise, 0.1 * trajectory.amplitude.max()))),
+        float(trajectory.amplitude[min(first, len(times) - 1) :].max()),
         noise,
         slow,
         misfit,
@@ -338,12 +339,12 @@ def _curves(form: NormalForm, amplitude: np.ndarray) -> Float[np.ndarray, "2 k"]
     return np.stack([natural, form.modal_damping(amplitude) / (2 * natural)])
 
 
-def _curve_std(found: SpectralSubmanifold, amplitude: np.ndarray) -> Float[np.ndarray, "2 k"]:
+def _curve_std(manifold: SpectralSubmanifold, amplitude: np.ndarray) -> Float[np.ndarray, "2 k"]:
     """1σ of both curves from the covariance of the form's unknowns."""
-    form = found.form
-    point, std = unknowns_of(form), np.sqrt(np.diag(found.covariance))
+    form = manifold.form
+    point, std = unknowns_of(form), np.sqrt(np.diag(manifold.covariance))
     slopes = np.zeros((2, len(amplitude), len(point)))
-    for k in range(2, len(point) - 2):  # neither the start nor the middle moves the curves
+    for k in range(2, len(point) - 2):  # the curves depend on neither start nor middle
         step = np.zeros(len(point))
         step[k] = _STEP * max(std[k], abs(point[k]), np.finfo(float).tiny)
         ends = [
@@ -353,4 +354,4 @@ def _curve_std(found: SpectralSubmanifold, amplitude: np.ndarray) -> Float[np.nd
             for sign in (1, -1)
         ]
         slopes[..., k] = (ends[0] - ends[1]) / (2 * step[k])
-    return np.sqrt(np.einsum("cki,ij,ckj->ck", slopes, found.covariance, slopes))
+    return np.sqrt(np.einsum("cki,ij,ckj->ck", slopes, manifold.covariance, slopes))

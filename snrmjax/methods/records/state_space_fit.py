@@ -1,8 +1,8 @@
 """A polynomial nonlinear state-space model fitted to the mean periods of multisine records.
 
-First over short stretches, each with a state of its own at its start (multiple shooting: a model
-that is wrong cannot run away from the record), then over whole periods, in the frequency domain,
-weighted by noise and by what the model cannot describe.
+First over short stretches, each with its own initial state (multiple shooting: a poor model cannot
+diverge from the record), then over whole periods, in the frequency domain, weighted by noise and
+model error.
 
 References: J. Paduart et al., Automatica 46 (2010) 647, doi:10.1016/j.automatica.2010.01.001,
 section 4; for multiple shooting, H. G. Bock & K. J. Plitt, IFAC Proc. 17 (1984) 1603,
@@ -45,18 +45,18 @@ from snrmjax.methods.records.state_space_start import (
 )
 from snrmjax.model.modes import LinearModes
 
-_PER_CYCLE = 32.0  # samples that the model has of a cycle of the mode
-_FEWEST_SAMPLES = 4.5  # a cycle of the mode, that a record must have
-_MOST_SAMPLES = 2**16  # of all realisations that are fitted
-_MOST_RECORDED = 2**22  # samples whose clipping is looked for
-_AWAY = 1e6  # rms velocities of the record: no motion of a model that is of any use
-_MUCH = 0.2  # of the velocity, that a fitted model may leave
+_PER_CYCLE = 32.0  # samples of the model per cycle of the mode
+_FEWEST_SAMPLES = 4.5  # of a record per cycle of the mode
+_MOST_SAMPLES = 2**16  # of all fitted realisations
+_MOST_RECORDED = 2**22  # samples of a record that is checked for clipping
+_AWAY = 1e6  # times the record's rms velocity: the model diverges
+_MUCH = 0.2  # largest relative residual of a fitted model
 _WIDTH = 31  # lines over which the misfit's power is averaged for the weights
-_ROUNDS = 3  # of fits, each weighted by what the one before left
-_SETTLING = 12  # periods at most until a simulated record repeats itself
+_ROUNDS = 3  # of fits, each weighted by the residual of the one before
+_SETTLING = 12  # simulated periods until the motion is periodic
 _MOST_MODES = 3  # of a model
 _STRETCHES = 16  # of a period at most
-_CYCLES = 6.0  # of the mode that a stretch has at least
+_CYCLES = 6.0  # of the mode, least length of a stretch
 
 
 class StateSpaceFit(NamedTuple):
@@ -71,10 +71,10 @@ class StateSpaceFit(NamedTuple):
     mode: int  # of the model, the one of interest
     largest: float  # m/s, velocity in the records
     linear: MultisineResponses
-    misfit: float  # rms of what the model leaves of the fitted records, relative
+    misfit: float  # relative rms residual of the fitted records
     linear_misfit: float  # likewise of the linear model
-    excess: float  # what is left of the fitted lines, over the noise that periods scatter by
-    validation: float  # of a realisation that was not fitted; NaN where there was only one
+    excess: float  # rms residual of the fitted lines over the noise from the scatter of periods
+    validation: float  # relative error of a realisation left out of the fit; NaN where there is one
 
 
 def fit_state_space(
@@ -91,19 +91,19 @@ def fit_state_space(
     """Fit a polynomial nonlinear state-space model to multisine records.
 
     Arguments: `recordings`, one a realisation of random phases, of one rate and period; `force`
-    (N) and `motion` (a velocity, or an acceleration or displacement, which are turned into
-    velocities line by line) name their channels; `modes` say where the mode of interest lies, by
-    default at the highest response; `order` is the number of states, where it is not stated two for
-    each of the `modes` in the excited band, six at most; `degrees` of the monomials; `period` in s,
-    found where it is not stated; `skip` periods at the start are left out. With two realisations
-    or more the last is not fitted but predicted.
+    (N) and `motion` (a velocity, or an acceleration or displacement, which are converted line by
+    line) name their channels; `modes` give the frequency of the mode of interest, by default that
+    of the highest response; `order` is the number of states, by default two for each of the
+    `modes` in the excited band, six at most; `degrees` of the monomials; `period` in s, by default
+    estimated; `skip` periods at the start are left out. Of two realisations or more the last is
+    left out of the fit for validation.
     Returns a `StateSpaceFit`. Raises `ValueError` as `multisine_responses` does, for an `order`
     that is odd or too high, for fewer than 4.5 samples a cycle, a clipped motion, where the
-    records do not hold as many oscillating modes as `order` wants, and where the fitted model
-    leaves more than 20 % of the velocity.
-    Validity: steady periodic records, noise of the force small, restoring and damping forces that
-    are polynomials of these degrees over the amplitudes that the records visit: 1σ does not know
-    what a higher degree would say, and with damping by v|v| its band on damping is too narrow
+    records do not have as many oscillating modes as `order` requires, and for a residual above
+    20 % of the velocity.
+    Validity: steady periodic records, little noise of the force, restoring and damping forces that
+    are polynomials of these degrees over the amplitudes of the records: 1σ does not include the
+    truncation error, and with v|v| damping the damping band is too narrow
     (`benchmarks/methods_loops_and_decays.py`).
     """
     if order not in (None, 2, 4, 6):
@@ -121,17 +121,17 @@ def fit_state_space(
     natural = _mode_frequency(linear, modes)
     order = _order(linear, modes) if order is None else order
     periods = _mean_periods(records, (force, channel), linear, skip, natural)
-    held_out = periods.force.shape[0] > 1
+    validated = periods.force.shape[0] > 1
     fitted = periods._replace(
-        force=periods.force[: -1 if held_out else None],
-        velocity=periods.velocity[: -1 if held_out else None],
+        force=periods.force[: -1 if validated else None],
+        velocity=periods.velocity[: -1 if validated else None],
     )
     exponents = monomials(order, degrees)
     linear_part = linear_model(linear, periods, order, len(exponents))
     start = Start(linear_part, linear_states(linear_part, fitted))
     linear_misfit = _misfit(start, fitted, exponents)
-    near = regressed(fitted, natural, exponents) if order == 2 else None
-    starts = [start] if near is None else [start, near]
+    regression = regressed(fitted, natural, exponents) if order == 2 else None
+    starts = [start] if regression is None else [start, regression]
     shot = [_over_stretches(start, fitted, exponents, natural) for start in starts]
     first = min([*starts, *shot], key=lambda start: _misfit(start, fitted, exponents))
     model, covariance, states = _fitted(first.model, first.states[:, 0], fitted, exponents, natural)
@@ -139,7 +139,7 @@ def fit_state_space(
     misfit = _relative(simulated, fitted.velocity)
     if not misfit < _MUCH:
         raise ValueError(
-            f"the best model of degree {max(degrees)} that was found leaves "
+            f"the residual of the best model of degree {max(degrees)} is "
             f"{100 * misfit:.3g} % of the velocity, more than {100 * _MUCH:g} %: a lower level, "
             "longer periods, more states or other degrees may help."
         )
@@ -156,20 +156,20 @@ def fit_state_space(
         misfit,
         linear_misfit,
         _excess(simulated, fitted, natural),
-        _validated(model, periods, exponents) if held_out else np.nan,
+        _validated(model, periods, exponents) if validated else np.nan,
     )
 
 
 def _of_velocity(linear: MultisineResponses, channel: Channel) -> MultisineResponses:
-    """The same of the motion's velocity."""
-    found = linear.responses
-    turn = velocity_factors([channel], [1], found.frequency)[:, 0, 0]
-    size = np.abs(turn)
+    """The responses converted to the motion's velocity."""
+    responses = linear.responses
+    factor = velocity_factors([channel], [1], responses.frequency)[:, 0, 0]
+    gain = np.abs(factor)
     return dataclasses.replace(
         linear,
-        responses=dataclasses.replace(found, values=found.values * turn),
-        noise_std=linear.noise_std * size,
-        total_std=linear.total_std * size,
+        responses=dataclasses.replace(responses, values=responses.values * factor),
+        noise_std=linear.noise_std * gain,
+        total_std=linear.total_std * gain,
     )
 
 
@@ -212,7 +212,7 @@ def _mean_periods(
             f"{_FEWEST_SAMPLES:g} samples a cycle of the mode at {natural / (2 * np.pi):.4g} Hz "
             f"are needed, but the records have {rate:g} Hz: the sampling rate is too low."
         )
-    # A number that a power of two of stretches divides.
+    # A multiple of the number of stretches, a power of two.
     cycles = linear.period * natural / (2 * np.pi)
     wanted = _STRETCHES * round(cycles * _PER_CYCLE / _STRETCHES)
     most = _MOST_SAMPLES // wanted
@@ -223,8 +223,8 @@ def _mean_periods(
         )
     names = (channels[0], channels[1].name)
     line = 2 * np.pi * np.arange(1, samples // 2 + 1) / linear.period
-    turn = np.concatenate([[0.0], velocity_factors([channels[1]], [1], line)[:, 0, 0]])
-    both = np.stack([np.ones_like(turn), turn])
+    factor = np.concatenate([[0.0], velocity_factors([channels[1]], [1], line)[:, 0, 0]])
+    both = np.stack([np.ones_like(factor), factor])
     means, noise = [], []
     for record in records[: max(2, most)]:
         spectra = []
@@ -259,16 +259,16 @@ def _outputs(model: StateSpace, starts: Array, force: Array, exponents: Exponent
 def _output_slopes(
     model: StateSpace, starts: Array, force: Array, exponents: Exponents
 ) -> tuple[Array, Array]:
-    """Outputs, and their derivatives by the coefficients and by their own first state."""
+    """Outputs, and their derivatives over the coefficients and over their own first state."""
     flat, rebuild = ravel_pytree(model)
 
-    def of(unknowns: Array, push: Array) -> Array:
+    def of(unknowns: Array, input_force: Array) -> Array:
         coefficients, start = unknowns[: len(flat)], unknowns[len(flat) :]
-        return simulated_output(rebuild(coefficients), start, push, exponents)
+        return simulated_output(rebuild(coefficients), start, input_force, exponents)
 
-    def both(start: Array, push: Array) -> tuple[Array, Array]:
+    def both(start: Array, input_force: Array) -> tuple[Array, Array]:
         at = jnp.concatenate([flat, start])
-        return of(at, push), jax.jacfwd(of)(at, push)
+        return of(at, input_force), jax.jacfwd(of)(at, input_force)
 
     return jax.vmap(both)(starts, force)
 
@@ -276,28 +276,28 @@ def _output_slopes(
 def _simulated(
     model: StateSpace, starts: np.ndarray, periods: Periods, exponents: Exponents
 ) -> Float[np.ndarray, "realisation sample"]:
-    found = _outputs(model, jnp.asarray(starts), jnp.asarray(periods.force), exponents)
-    return _in_bounds(found, found)[0]
+    outputs = _outputs(model, jnp.asarray(starts), jnp.asarray(periods.force), exponents)
+    return _in_bounds(outputs, outputs)[0]
 
 
-def _in_bounds(found: Array, slopes: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Outputs and slopes as they are, or NaN all over where the model runs away."""
-    values, steep = np.asarray(found), np.asarray(slopes)
-    if np.all(np.abs(values) < _AWAY) and np.isfinite(steep).all():
-        return values, steep
-    return np.full_like(values, np.nan), np.full_like(steep, np.nan)
+def _in_bounds(outputs: Array, slopes: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Outputs and slopes unchanged, or all NaN where the model diverges."""
+    values, jacobian = np.asarray(outputs), np.asarray(slopes)
+    if np.all(np.abs(values) < _AWAY) and np.isfinite(jacobian).all():
+        return values, jacobian
+    return np.full_like(values, np.nan), np.full_like(jacobian, np.nan)
 
 
-def _relative(found: np.ndarray, measured: np.ndarray) -> float:
-    return float(np.sqrt(np.mean((found - measured) ** 2) / np.mean(measured**2)))
+def _relative(simulated: np.ndarray, measured: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((simulated - measured) ** 2) / np.mean(measured**2)))
 
 
 def _misfit(start: Start, periods: Periods, exponents: Exponents) -> float:
-    """Relative rms error over whole periods; infinite where the model runs away."""
-    found = _relative(
+    """Relative rms error over whole periods; infinite where the model diverges."""
+    error = _relative(
         _simulated(start.model, start.states[:, 0], periods, exponents), periods.velocity
     )
-    return found if np.isfinite(found) else np.inf
+    return error if np.isfinite(error) else np.inf
 
 
 def _over_stretches(start: Start, periods: Periods, exponents: Exponents, natural: float) -> Start:
@@ -316,15 +316,15 @@ def _over_stretches(start: Start, periods: Periods, exponents: Exponents, natura
         for point in points:
             first = jnp.asarray(point[len(flat) :].reshape(-1, states))
             model = rebuild(jnp.asarray(point[: len(flat)]))
-            found, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
-            steep = _with_own_states(slopes, len(flat)) / unit
-            trials.append(StateSpaceTrial((found - target).ravel() / unit, steep))
+            outputs, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
+            jacobian = _with_own_states(slopes, len(flat)) / unit
+            trials.append(StateSpaceTrial((outputs - target).ravel() / unit, jacobian))
         return trials
 
     point = np.concatenate([np.asarray(flat), firsts.ravel()])
-    for _ in range(2):  # the unit is what the fit before left
-        left = evaluate(point[None], 1.0)[0].residuals
-        unit = float(np.sqrt(np.mean(left**2)))
+    for _ in range(2):  # the unit is the rms residual of the fit before
+        residuals = evaluate(point[None], 1.0)[0].residuals
+        unit = float(np.sqrt(np.mean(residuals**2)))
         if not np.isfinite(unit):
             return start
         point = least_squares(partial(evaluate, unit=unit), point).point
@@ -354,24 +354,24 @@ def _fitted(
         for point in points:
             model = rebuild(jnp.asarray(point[: len(flat)]))
             first = jnp.asarray(point[len(flat) :].reshape(count, states))
-            found, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
-            left = (_spectrum(found, lines) - target) / std
-            steepness = _spectrum(np.moveaxis(slopes, 2, 1), lines) / std
-            steep = _with_own_states(np.moveaxis(steepness, 1, 2), len(flat))
-            trials.append(StateSpaceTrial(as_real(left.ravel()), as_real(steep)))
+            outputs, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
+            residual = (_spectrum(outputs, lines) - target) / std
+            spectra = _spectrum(np.moveaxis(slopes, 2, 1), lines) / std
+            jacobian = _with_own_states(np.moveaxis(spectra, 1, 2), len(flat))
+            trials.append(StateSpaceTrial(as_real(residual.ravel()), as_real(jacobian)))
         return trials
 
-    left = _spectrum(_simulated(start, starts, periods, exponents), lines) - target
+    residual = _spectrum(_simulated(start, starts, periods, exponents), lines) - target
     for _ in range(_ROUNDS):
-        std = _error(left, periods.noise[lines])
+        std = _error(residual, periods.noise[lines])
         best = least_squares(partial(evaluate, std=std), point)
         point = best.point
         linearised = best.linearised
-        size = count * len(lines)
-        left = (linearised.residuals[:size] + 1j * linearised.residuals[size:]).reshape(
+        half = count * len(lines)
+        residual = (linearised.residuals[:half] + 1j * linearised.residuals[half:]).reshape(
             count, len(lines)
         ) * std
-    std = _error(left, periods.noise[lines])
+    std = _error(residual, periods.noise[lines])
     [last] = evaluate(point[None], std)
     # A complex error of variance std² has half of it in each part.
     scale = np.linalg.norm(last.jacobian, axis=0)
@@ -386,7 +386,7 @@ def _fitted(
 
 
 def _with_own_states(slopes: np.ndarray, shared: int) -> np.ndarray:
-    """Slopes of stretches (stretch, row, …) by `shared` coefficients and each by its own state."""
+    """Jacobian from slopes (stretch, row, …) over `shared` coefficients and own initial states."""
     count, rows, width = slopes.shape
     by_states = np.zeros((count, rows, count, width - shared), dtype=slopes.dtype)
     by_states[np.arange(count), :, np.arange(count)] = slopes[..., shared:]
@@ -395,35 +395,35 @@ def _with_own_states(slopes: np.ndarray, shared: int) -> np.ndarray:
 
 
 def _lines(periods: Periods, natural: float) -> np.ndarray:
-    """Lines that are fitted."""
+    """Fitted lines."""
     highest = HIGHEST * natural / (2 * np.pi * periods.rate) * periods.force.shape[1]
     return np.arange(1, min(len(periods.noise), int(highest)))
 
 
 def _excess(simulated: np.ndarray, periods: Periods, natural: float) -> float:
-    """rms of what a model leaves of the fitted lines, over that of the noise."""
+    """rms residual of the fitted lines over the noise."""
     lines = _lines(periods, natural)
-    left = _spectrum(simulated - periods.velocity, lines)
+    residual = _spectrum(simulated - periods.velocity, lines)
     noise = max(float(np.mean(periods.noise[lines])), np.finfo(float).tiny)
-    return float(np.sqrt(np.mean(np.abs(left) ** 2) / noise))
+    return float(np.sqrt(np.mean(np.abs(residual) ** 2) / noise))
 
 
 def _spectrum(signal: np.ndarray, lines: np.ndarray) -> Complex[np.ndarray, "*batch line"]:
     return np.fft.rfft(signal, axis=-1)[..., lines] * 2 / signal.shape[-1]
 
 
-def _error(left: np.ndarray, noise: np.ndarray) -> Float[np.ndarray, " line"]:
-    """rms complex error of a line: noise, and what a model leaves of lines around it."""
+def _error(residual: np.ndarray, noise: np.ndarray) -> Float[np.ndarray, " line"]:
+    """rms complex error of a line: the larger of noise and mean residual of lines around it."""
     window = np.ones(_WIDTH)
     around = np.convolve(np.ones(len(noise)), window, "same")
-    misfit = np.convolve(np.mean(np.abs(left) ** 2, axis=0), window, "same") / around
+    misfit = np.convolve(np.mean(np.abs(residual) ** 2, axis=0), window, "same") / around
     smooth = np.convolve(noise, window, "same") / around
     return np.sqrt(np.maximum(misfit, smooth))
 
 
 def _validated(model: StateSpace, periods: Periods, exponents: Exponents) -> float:
-    """Relative error of the last realisation, driven until the motion repeats itself."""
+    """Relative error of the last realisation, simulated until the motion is periodic."""
     once = jnp.asarray(np.tile(periods.force[-1:], (1, _SETTLING)))
     none = jnp.zeros((1, 2 * len(model.poles)))
-    found = np.asarray(_outputs(model, none, once, exponents)).reshape(_SETTLING, -1)
-    return _relative(found[-1], periods.velocity[-1])
+    outputs = np.asarray(_outputs(model, none, once, exponents)).reshape(_SETTLING, -1)
+    return _relative(outputs[-1], periods.velocity[-1])

@@ -1,7 +1,7 @@
-"""Where the fit of a nonlinear state-space model starts: linear models of a multisine test.
+"""Start models for the fit of a nonlinear state-space model to a multisine test.
 
-Two starts: the poles of the best linear approximation by subspaces, with all coefficients refined
-on it; and, for one mode, a regression of each sample on the one before.
+Two starts: poles of the best linear approximation by a subspace method, with all coefficients then
+fitted to it; and, for one mode, a regression of each sample on the one before.
 
 References: T. McKelvey, H. Akçay & L. Ljung, IEEE Trans. Autom. Control 41 (1996) 960,
 doi:10.1109/9.508900, algorithm 2 (frequencies need not be even); J. Paduart et al., Automatica 46
@@ -22,9 +22,9 @@ from snrmjax.methods.records.state_space import Exponents, StateSpace, hold, res
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
 
 HIGHEST = 4.0
-"""Times the mode's frequency: lines that are fitted, to the third harmonic and beyond."""
+"""Times the mode's frequency: highest fitted line, beyond the third harmonic."""
 
-_FLOOR = 1e-4  # of a line's size: least error of a best linear approximation
+_FLOOR = 1e-4  # of a line's magnitude: least error of a best linear approximation
 _RULE = StepRule(steps=40, settled=0.5, damping=1e-2)
 
 
@@ -33,7 +33,7 @@ class Periods(NamedTuple):
 
     force: Float[np.ndarray, "realisation sample"]  # over the sampling's hold, see `hold`
     velocity: Float[np.ndarray, "realisation sample"]
-    noise: Float[np.ndarray, " line"]  # variance of a line of the mean, peak amplitudes
+    noise: Float[np.ndarray, " line"]  # variance of a line of the mean period, peak amplitudes
     rate: float
     units: tuple[float, float]
 
@@ -55,29 +55,29 @@ class Start(NamedTuple):
 def least_squares(
     evaluate: Callable[[np.ndarray], list[StateSpaceTrial]], point: Float[np.ndarray, " unknown"]
 ) -> Minimum[StateSpaceTrial]:
-    """The minimum next to a point."""
+    """The minimum nearest to a start point."""
     unlimited = np.full(len(point), np.inf)
-    [found] = minimise(evaluate, point[None], evaluate(point[None]), (-unlimited, unlimited), _RULE)
-    return found
+    [best] = minimise(evaluate, point[None], evaluate(point[None]), (-unlimited, unlimited), _RULE)
+    return best
 
 
 def linear_model(
     linear: MultisineResponses, periods: Periods, order: int, terms: int
 ) -> StateSpace:
-    """The linear model that fits the best linear approximation, with no polynomial yet.
+    """The linear model that fits the best linear approximation, with a zero polynomial.
 
-    Raises `ValueError` where it does not have as many oscillating modes as `order` wants.
+    Raises `ValueError` where it has fewer or more oscillating modes than `order` requires.
     """
     scale = periods.units[0] / periods.units[1]
     values = linear.responses.values[0, 0] * scale
     known = linear.total_std if np.isfinite(linear.total_std).all() else linear.noise_std
     std = np.maximum(known[0] * scale, _FLOOR * np.abs(values))
-    turn = np.exp(1j * linear.responses.frequency / periods.rate)
-    below = linear.responses.frequency < np.pi * periods.rate
-    turn, values, weight = turn[below], values[below], 1 / std[below]
-    held = hold(np.angle(turn))  # the model's force is the recorded one over it
-    values, weight = values * held, weight / held
-    multipliers = subspace_poles(turn, values, weight, order)
+    z = np.exp(1j * linear.responses.frequency / periods.rate)
+    in_band = linear.responses.frequency < np.pi * periods.rate
+    z, values, weight = z[in_band], values[in_band], 1 / std[in_band]
+    hold_gain = hold(np.angle(z))  # the model's force is the recorded one divided by it
+    values, weight = values * hold_gain, weight / hold_gain
+    multipliers = subspace_poles(z, values, weight, order)
     oscillating = np.sort_complex(multipliers[multipliers.imag > 1e-6])[::-1]
     if len(oscillating) != order // 2:
         raise ValueError(
@@ -86,7 +86,7 @@ def linear_model(
         )
     oscillating *= np.minimum(1.0, (1 - 1e-6) / np.abs(oscillating))
     poles = np.stack([oscillating.real, oscillating.imag], axis=1)
-    drive, through = linear_terms(turn, values, weight, poles)
+    drive, through = linear_terms(z, values, weight, poles)
     none = jnp.zeros((order, terms))
     model = StateSpace(jnp.asarray(poles), jnp.asarray(drive), jnp.asarray(through), none)
     flat, rebuild = ravel_pytree(model)
@@ -96,10 +96,10 @@ def linear_model(
         trials = []
         for point in points:
             full = jnp.concatenate([jnp.asarray(point), flat[free:]])
-            value, slope = _response_slopes(rebuild(full), jnp.asarray(turn))
-            left = (np.asarray(value) - values) * weight
-            steep = np.asarray(slope)[:, :free] * weight[:, None]
-            trials.append(StateSpaceTrial(as_real(left), as_real(steep)))
+            value, slope = _response_slopes(rebuild(full), jnp.asarray(z))
+            residual = (np.asarray(value) - values) * weight
+            jacobian = np.asarray(slope)[:, :free] * weight[:, None]
+            trials.append(StateSpaceTrial(as_real(residual), as_real(jacobian)))
         return trials
 
     point = np.asarray(flat[:free])
@@ -113,46 +113,47 @@ def linear_states(
     """States of the linear model's periodic motion."""
     spectra = np.fft.rfft(periods.force, axis=1)
     count = periods.force.shape[1]
-    turn = np.exp(2j * np.pi * np.arange(spectra.shape[1]) / count)
+    z = np.exp(2j * np.pi * np.arange(spectra.shape[1]) / count)
     states = []
     for (p, q), (b1, b2) in zip(np.asarray(model.poles), np.asarray(model.drive), strict=True):
-        below = (turn - p) ** 2 + q**2
-        for top in ((turn - p) * b1 + q * b2, (turn - p) * b2 - q * b1):
-            states.append(np.fft.irfft(spectra * top / below, count, axis=1))
+        denominator = (z - p) ** 2 + q**2
+        for top in ((z - p) * b1 + q * b2, (z - p) * b2 - q * b1):
+            states.append(np.fft.irfft(spectra * top / denominator, count, axis=1))
     return np.stack(states, axis=2)
 
 
 def regressed(periods: Periods, natural: float, exponents: Exponents) -> Start | None:
-    """A model of one mode and its states from displacement and velocity, sample to sample.
+    """A model of one mode and its states by regression of each sample on the one before.
 
-    With both as states (the displacement from the velocity's spectrum) the next sample is linear
-    in all coefficients. Noise biases them: a start. None where no oscillating mode comes out.
+    With displacement (from the velocity's spectrum) and velocity as states the next sample is
+    linear in all coefficients. Noise biases them: only a start. None without an oscillating mode.
     """
     count = periods.force.shape[1]
     spectra = np.fft.rfft(periods.velocity, axis=1)
     line = np.arange(spectra.shape[1])
     highest = HIGHEST * natural / (2 * np.pi * periods.rate) * count
     spectra[:, (line == 0) | (line > highest)] = 0
-    turning = np.where(line == 0, 1.0, 2 * np.pi * line / count * periods.rate / natural)
-    seen = [
-        np.fft.irfft(spectrum, count, axis=1) for spectrum in (spectra, spectra / (1j * turning))
+    angular_rate = np.where(line == 0, 1.0, 2 * np.pi * line / count * periods.rate / natural)
+    signals = [
+        np.fft.irfft(spectrum, count, axis=1)
+        for spectrum in (spectra, spectra / (1j * angular_rate))
     ]
-    states = np.stack(seen, axis=-1)
-    turn = np.eye(2)
+    states = np.stack(signals, axis=-1)
+    basis = np.eye(2)
     for _ in range(2):  # in these coordinates, then in those of the model
-        now = states @ turn.T
+        now = states @ basis.T
         terms = [np.prod(now**powers, axis=-1) for powers in exponents]
         design = np.stack([now[..., 0], now[..., 1], periods.force, *terms], axis=-1)
-        later = np.roll(now, -1, axis=1)
+        following = np.roll(now, -1, axis=1)
         table = design.reshape(-1, design.shape[-1])
-        size = np.linalg.norm(table, axis=0)
-        solved = np.linalg.lstsq(table / size, later.reshape(-1, 2), rcond=None)[0].T / size
+        scale = np.linalg.norm(table, axis=0)
+        solved = np.linalg.lstsq(table / scale, following.reshape(-1, 2), rcond=None)[0].T / scale
         matrix = solved[:, :2]
         multiplier = np.linalg.eigvals(matrix)[0]
         p, q = float(multiplier.real), float(abs(multiplier.imag))
         if not q > 0:
             return None
-        turn = np.array([[1.0, 0.0], [(matrix[0, 0] - p) / q, matrix[0, 1] / q]]) @ turn
+        basis = np.array([[1.0, 0.0], [(matrix[0, 0] - p) / q, matrix[0, 1] / q]]) @ basis
     model = StateSpace(
         jnp.array([[p, q]]),
         jnp.asarray(solved[None, :, 2]),
@@ -163,17 +164,17 @@ def regressed(periods: Periods, natural: float, exponents: Exponents) -> Start |
 
 
 @jax.jit
-def _response_slopes(model: StateSpace, turn: Array) -> tuple[Array, Array]:
+def _response_slopes(model: StateSpace, z: Array) -> tuple[Array, Array]:
     flat, rebuild = ravel_pytree(model)
 
     def of(coefficients: Array) -> Array:
-        return response(rebuild(coefficients), turn)
+        return response(rebuild(coefficients), z)
 
     return of(flat), jax.jacfwd(of)(flat)
 
 
 def subspace_poles(
-    turn: Complex[np.ndarray, " frequency"],
+    z: Complex[np.ndarray, " frequency"],
     values: Complex[np.ndarray, " frequency"],
     weight: Float[np.ndarray, " frequency"],
     states: int,
@@ -182,40 +183,40 @@ def subspace_poles(
 ) -> Complex[np.ndarray, " state"]:
     """Eigenvalues of A, with G(z) = C (z I − A)⁻¹ B + D near the given values.
 
-    Arguments: `turn` is z = e^{iΩ/rate}; `weight` multiplies each line's equations; `rows` of the
+    Arguments: `z` = e^{iΩ/rate}; `weight` multiplies each line's equations; `rows` of the
     extended observability matrix.
     """
     count = max(rows, states + 2)
-    powers = turn ** np.arange(count)[:, None] * weight
+    powers = z ** np.arange(count)[:, None] * weight
     stacked = [_real(powers), _real(powers * values)]
     _, triangle = np.linalg.qr(np.concatenate(stacked).T)
     upper = triangle.T
     left, _, _ = np.linalg.svd(upper[count:, count:])
-    seen = left[:, :states]
-    return np.linalg.eigvals(np.linalg.lstsq(seen[:-1], seen[1:], rcond=None)[0])
+    observability = left[:, :states]
+    return np.linalg.eigvals(np.linalg.lstsq(observability[:-1], observability[1:], rcond=None)[0])
 
 
 def linear_terms(
-    turn: Complex[np.ndarray, " frequency"],
+    z: Complex[np.ndarray, " frequency"],
     values: Complex[np.ndarray, " frequency"],
     weight: Float[np.ndarray, " frequency"],
     poles: Float[np.ndarray, "mode 2"],
 ) -> tuple[Float[np.ndarray, "mode 2"], float]:
-    """Input of each mode and feedthrough that fit best with given poles, C = (1, 0) a mode."""
+    """Least-squares input of each mode and feedthrough for given poles, C = (1, 0) per mode."""
     columns = []
     for p, q in poles:
-        below = (turn - p) ** 2 + q**2
-        columns += [(turn - p) / below, q / below]
-    design = _real(np.stack([*columns, np.ones_like(turn)]) * weight).T
+        denominator = (z - p) ** 2 + q**2
+        columns += [(z - p) / denominator, q / denominator]
+    design = _real(np.stack([*columns, np.ones_like(z)]) * weight).T
     solved = np.linalg.lstsq(design, _real((values * weight)[None])[0], rcond=None)[0]
     return solved[:-1].reshape(-1, 2), float(solved[-1])
 
 
 def _real(values: np.ndarray) -> np.ndarray:
-    """Real and imaginary parts side by side."""
+    """Real and imaginary parts, joined along the columns."""
     return np.concatenate([values.real, values.imag], axis=1)
 
 
 def as_real(values: np.ndarray) -> np.ndarray:
-    """Real parts above imaginary ones."""
+    """Real and imaginary parts, joined along the rows."""
     return np.concatenate([values.real, values.imag])

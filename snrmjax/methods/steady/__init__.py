@@ -1,1 +1,1 @@
-"""Methods that read a table of steady states."""
+"""Methods for tables of steady states."""

@@ -1,8 +1,8 @@
 """Describing functions of a local nonlinear element, from nonlinear and linear receptances.
 
-One element between a known point and the ground is all that is nonlinear. What it pulls with is
-what the measured motion lacks to the linear one, X = H_rb F − H_rr N, and N = v(X) X is its
-describing function: Re v a stiffness and Im v a loss at that amplitude.
+The only nonlinearity is one element between a known point and the ground. Its force N follows
+from the difference between measured and linear response, X = H_rb F − H_rr N, and N = v(X) X
+defines its describing function: Re v is the stiffness and Im v the loss at that amplitude.
 
 Reference: Ö. Arslan, M. Aykan & H. N. Özgüven, Mech. Syst. Signal Process. 25 (2011) 1112.
 """
@@ -25,15 +25,15 @@ from snrmjax.model.modes import (
 def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:
     """Natural frequency and damping that the describing function at each state implies.
 
-    The element is taken to act between the reference sensor and the ground, and all other motion
-    to be the linear modes of `modes`. The mode of the structure with stiffness Re v(X) and damping
-    Im v(X)/Ω added at the sensor is followed from the mode of interest.
+    The element acts between the reference sensor and the ground; the rest of the structure is
+    that of the linear `modes`. The point is the mode of interest of the structure with stiffness
+    Re v(X) and damping Im v(X)/Ω added at the sensor.
 
     Arguments: `data` with forces in N and phases; `modes` with all modes that respond, rigid-body
-    modes included. Returns a `MethodResult` with one point a state, at velocity ω̃ |X|; 1σ from
-    the stated errors, by differences.
+    modes included. Returns a `MethodResult` with one point per state, at velocity ω̃ |X|; 1σ
+    from the stated errors, by finite differences.
     Raises `ValueError` where the data have no forces or no phases.
-    Validity: the element stands at the reference sensor; errors of the linear model enter in full.
+    Validity: the element is at the reference sensor; errors of the linear model enter in full.
     """
     states = sensor_states(data, modes)
     points = [_point(states, k, modes) for k in range(len(states.level))]
@@ -41,34 +41,36 @@ def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:
 
 
 def describing_function(states: SensorStates, modes: LinearModes) -> Complex[np.ndarray, " state"]:
-    """v(X) = N/X in N/m at the reference sensor, one number a state."""
-    r, turn = reference_sensor(modes), np.sign(signed_drive_point(modes))
+    """Describing function v(X) = N/X in N/m at the reference sensor, for each state."""
+    r, sign = reference_sensor(modes), np.sign(signed_drive_point(modes))
     flexible, square = np.asarray(modes.mode_shape)[r], states.frequency**2
-    whole = np.asarray(
+    impedance = np.asarray(
         dynamic_stiffness(modes, np.arange(modes.n_modes), jnp.asarray(1j * states.frequency))
     )
     loads = np.stack([np.asarray(phasor_of_load(modes)), flexible], axis=1)
-    moved = flexible @ np.linalg.solve(whole, loads[None])
+    response = flexible @ np.linalg.solve(impedance, loads[None])
     rigid = np.asarray(modes.rigid_body_shape)[r]
     per_force = rigid @ np.asarray(modes.rigid_body_participation)
-    driven = turn * (moved[:, 0] - per_force / square)
-    direct = moved[:, 1] - rigid @ rigid / square
+    driven = sign * (response[:, 0] - per_force / square)
+    direct = response[:, 1] - rigid @ rigid / square
     return (driven * states.force - states.displacement) / (direct * states.displacement)
 
 
 def _point(states: SensorStates, k: int, modes: LinearModes) -> MethodPoint:
-    """The mode that one state implies, with 1σ by differences of amplitude and phase."""
+    """The mode that one state implies, with 1σ by finite differences of amplitude and phase."""
     state = states.of(np.array([k]))
-    found = _mode_of(state, modes)
-    if found is None:
+    mode = _mode_of(state, modes)
+    if mode is None:
         return MethodPoint(MethodStatus.NOT_A_MODE, int(state.level[0]))
-    natural, ratio = found
+    natural, ratio = mode
     step = 1e-6
-    slopes = []
-    for turned in (1 + step, np.exp(1j * step)):
-        moved = _mode_of(state._replace(velocity=state.velocity * turned), modes)
-        slopes.append(np.nan * np.zeros(2) if moved is None else (np.array(moved) - found) / step)
-    std = np.hypot(slopes[0] * state.amplitude_std, slopes[1] * state.phase_std)
+    derivatives = []
+    for factor in (1 + step, np.exp(1j * step)):
+        response = _mode_of(state._replace(velocity=state.velocity * factor), modes)
+        derivatives.append(
+            np.nan * np.zeros(2) if response is None else (np.array(response) - mode) / step
+        )
+    std = np.hypot(derivatives[0] * state.amplitude_std, derivatives[1] * state.phase_std)
     return MethodPoint(
         MethodStatus.FOUND,
         int(state.level[0]),
@@ -83,28 +85,28 @@ def _point(states: SensorStates, k: int, modes: LinearModes) -> MethodPoint:
 def _eigenvalue_of(
     stiffness: Float[np.ndarray, "mode mode"], damping: Float[np.ndarray, "mode mode"], which: int
 ) -> tuple[float, float] | None:
-    """|λ| and −Re λ/|λ| of the complex mode in which one mode moves most."""
+    """|λ| and −Re λ/|λ| of the complex mode with the largest component of mode `which`."""
     n = len(stiffness)
     state = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -damping]])
     values, vectors = np.linalg.eig(state)
     rising = values.imag > 0
     if not rising.any():
         return None
-    own = np.abs(vectors[which]) / np.linalg.norm(vectors[:n], axis=0)
-    value = values[np.argmax(np.where(rising, own, -1.0))]
+    linear_damping = np.abs(vectors[which]) / np.linalg.norm(vectors[:n], axis=0)
+    value = values[np.argmax(np.where(rising, linear_damping, -1.0))]
     return (float(abs(value)), float(-value.real / abs(value))) if value.real < 0 else None
 
 
 def _mode_of(state: SensorStates, modes: LinearModes) -> tuple[float, float] | None:
-    """ω̃ and ζ̃ of the mode of interest with the element of one state; None where it has none."""
+    """ω̃ and ζ̃ of the mode of interest with the element of one state; None where not positive."""
     v = complex(describing_function(state, modes)[0])
     shape = np.asarray(modes.mode_shape)[reference_sensor(modes)]
     natural = np.asarray(modes.natural_frequency)
     stiffness = np.diag(natural**2) + v.real * np.outer(shape, shape)
     if modes.damping_coupling is not None:
-        own = np.diag(2 * np.asarray(modes.damping_ratio) * natural)
+        linear_damping = np.diag(2 * np.asarray(modes.damping_ratio) * natural)
         rate = v.imag / float(state.frequency[0])
-        damped = own + np.asarray(modes.damping_coupling) + rate * np.outer(shape, shape)
+        damped = linear_damping + np.asarray(modes.damping_coupling) + rate * np.outer(shape, shape)
         return _eigenvalue_of(stiffness, damped, modes.mode_of_interest)
     squares, vectors = np.linalg.eigh(stiffness)
     k = int(np.argmax(np.abs(vectors[modes.mode_of_interest])))

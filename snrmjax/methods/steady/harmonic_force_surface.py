@@ -1,8 +1,8 @@
 """Harmonic force surface: the force that a response needs, over frequency and amplitude.
 
 Response-controlled levels give the complex force F(Ω, X) at each frequency and displacement. The
-surface between them, cut at a constant |F|, is the response that a test under that force would
-show, with the parts that it would jump over: they are ordinary points of the surface.
+interpolated surface, cut at constant |F|, is the response to that constant force, including the
+branch that a sweep would jump over.
 
 Reference: T. Karaağaçlı & H. N. Özgüven, Vibration 3 (2020) 266,
 doi:10.3390/vibration3030019.
@@ -20,8 +20,8 @@ from snrmjax.methods.steady.equal_amplitude import AmplitudeSection, sections_of
 from snrmjax.model.modes import LinearModes
 
 _FEWEST_LEVELS, _FEWEST_STATES = 2, 3
-_WITHIN = 2.0  # times the least force: states that the parabola is fitted to
-_FINE = 400  # amplitudes between levels at which a cut looks for the force
+_WITHIN = 2.0  # times the least force: range of the parabola fit
+_FINE = 400  # interpolated amplitudes in which a cut is searched
 
 
 class ForceSurface(NamedTuple):
@@ -32,34 +32,36 @@ class ForceSurface(NamedTuple):
     force: Complex[np.ndarray, "level frequency"]  # N, relative to the displacement
 
     def cut(self, force: float) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
-        """Frequencies (rad/s) and displacement amplitudes (m) that a constant force (N) holds.
+        """Frequencies (rad/s) and displacement amplitudes (m) under a constant force (N).
 
-        At each frequency every amplitude at which |F| passes the force is a point, so that up to
-        three share a frequency. Sorted by frequency; empty where the force is off the surface.
+        Every amplitude at which |F| crosses the force is a point, so that up to three share a
+        frequency. Sorted by frequency; empty where the force is outside the surface.
         """
         fine = np.linspace(self.amplitude[0], self.amplitude[-1], _FINE)
-        found: list[tuple[float, float]] = []
+        crossings: list[tuple[float, float]] = []
         for k, omega in enumerate(self.frequency):
             column = self.force[:, k]
             real = np.interp(fine, self.amplitude, column.real)
-            size = np.abs(real + 1j * np.interp(fine, self.amplitude, column.imag)) - force
-            for j in np.flatnonzero(np.sign(size[:-1]) != np.sign(size[1:])):
-                fraction = size[j] / (size[j] - size[j + 1])
-                found.append((float(omega), float(fine[j] + fraction * (fine[j + 1] - fine[j]))))
-        points = np.array(sorted(found)).reshape(-1, 2)
+            excess = np.abs(real + 1j * np.interp(fine, self.amplitude, column.imag)) - force
+            for j in np.flatnonzero(np.sign(excess[:-1]) != np.sign(excess[1:])):
+                fraction = excess[j] / (excess[j] - excess[j + 1])
+                crossings.append(
+                    (float(omega), float(fine[j] + fraction * (fine[j + 1] - fine[j])))
+                )
+        points = np.array(sorted(crossings)).reshape(-1, 2)
         return points[:, 0], points[:, 1]
 
 
 def force_surface(data: SteadyStates, modes: LinearModes) -> ForceSurface:
-    """The surface between the levels of a test, on the frequencies that all of them cover.
+    """The surface interpolated between levels, at the frequencies that all levels cover.
 
     Raises `ValueError` where fewer than two amplitudes have three states, or share no frequencies.
     """
     sections = _usable(data, modes)
     if len(sections) < _FEWEST_LEVELS:
         raise ValueError(
-            "two levels of held displacement or more with three states each are needed, but the "
-            f"data have {len(sections)}."
+            "two or more levels of controlled displacement with three states each are needed, but "
+            f"the data have {len(sections)}."
         )
     low = max(section.frequency[0] for section in sections)
     high = min(section.frequency[-1] for section in sections)
@@ -73,15 +75,15 @@ def force_surface(data: SteadyStates, modes: LinearModes) -> ForceSurface:
 
 
 def harmonic_force_surface(data: SteadyStates, modes: LinearModes) -> MethodResult:
-    """The peak of the response that each cut would show, by level of displacement.
+    """Peak of the constant-force response, by level of displacement.
 
-    At each amplitude the force that holds it is least at the peak of the response under that
-    force: a parabola through |F|² against Ω² near it gives its frequency, and the balance of
-    power, 2ζ̃ω̃ = |Φ_r Φᵀb| |F| / |v|, its damping.
+    At each amplitude the required force is least at the peak of the response to that force: a
+    parabola through |F|² against Ω² near it gives its frequency, and the power balance,
+    2ζ̃ω̃ = |Φ_r Φᵀb| |F| / |v|, its damping.
 
     Arguments: `data` with forces in N and phases; `modes` has the modal mass of the mode of
-    interest. Returns a `MethodResult` with one point an amplitude; without 1σ, which the method
-    does not give. Levels whose least force lies at their end are `NO_RESONANCE`.
+    interest. Returns a `MethodResult` with one point per amplitude, without 1σ, which the method
+    does not give. Levels whose least force is at an end are `NO_RESONANCE`.
     Raises `ValueError` where the data have no forces or no phases.
     """
     sections = _usable(data, modes)
@@ -105,10 +107,10 @@ def _interpolated(
 
 
 def _peak(section: AmplitudeSection, per_force: float) -> MethodPoint:
-    """The frequency of least force of one section.
+    """Frequency of least force of one section.
 
-    |F|² of a linear mode is a parabola in Ω²: it is fitted to the states of up to twice the least
-    force, relative errors alike, and to the three about the least one where those are fewer.
+    |F|² of a linear mode is a parabola in Ω², fitted with equal relative weights to the states of
+    up to twice the least force, at least to the three states around it.
     """
     square = np.abs(section.stiffness) ** 2
     k = int(np.argmin(square))

@@ -1,8 +1,8 @@
-"""Response-controlled stepped sine: a linear mode fitted at each held amplitude.
+"""Response-controlled stepped sine: a linear mode fitted at each controlled amplitude.
 
-With the amplitude of displacement held, a nonlinear mode answers as a linear one, so that
-standard modal analysis of each level gives natural frequency and damping at its amplitude. The
-analysis here is the straight line of inverse receptance, F/X = (λ − Ω²)/C, by least squares.
+At constant displacement amplitude a nonlinear mode responds linearly, so that standard modal
+analysis of each level gives natural frequency and damping at its amplitude. Here a straight line
+is fitted to the inverse receptance, F/X = (λ − Ω²)/C, by least squares.
 
 Reference: T. Karaağaçlı & H. N. Özgüven, Vibration 3 (2020) 266,
 doi:10.3390/vibration3030019; for the line, D. J. Ewins, Modal Testing (2000), section 4.2.
@@ -18,25 +18,25 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
 
 _UNKNOWNS = 2  # complex: 1/C and λ/C
-_NEAR = 3.0  # half-power widths about resonance that a section keeps
+_NEAR = 3.0  # half-power bandwidths on each side of resonance in the second fit
 
 
 def rct(data: SteadyStates, modes: LinearModes) -> MethodResult:
-    """Natural frequency and damping at each held amplitude of displacement.
+    """Natural frequency and damping at each controlled displacement amplitude.
 
-    Levels whose displacement stays within ±10 % are fitted as they are. Where there are none
-    (tests of constant force) the levels are cut at amplitudes that both sides of several reach.
+    Levels whose displacement stays within ±10 % are fitted directly. Where there are none (tests
+    of constant force) the levels are interpolated at common amplitudes on both sides of resonance.
 
-    Arguments: `data` with forces (or drive voltages) and phases; `modes` names the sensor, its
-    numbers do not enter. Returns a `MethodResult` with one point an amplitude; 1σ from the scatter
-    about the line. Sections of fewer than three states are `TOO_FEW_STATES`.
+    Arguments: `data` with forces (or drive voltages) and phases; `modes` only names the sensor.
+    Returns a `MethodResult` with one point per amplitude; 1σ from the scatter about the line.
+    Sections of fewer than three states are `TOO_FEW_STATES`.
     Raises `ValueError` where the data have neither forces nor drive voltages, or no phases.
-    Validity: one mode near resonance with damping that counts as hysteretic; a response level
-    that wanders within ±10 % is averaged.
+    Validity: one mode near resonance with hysteretic damping; a response level that varies within
+    ±10 % is averaged.
     """
     states = sensor_states(data, modes, any_scale=True)
-    sections, held = sections_of(states)
-    notes = () if held else (Fact("sections_between_levels", spread=CONTROLLED),)
+    sections, controlled = sections_of(states)
+    notes = () if controlled else (Fact("sections_between_levels", spread=CONTROLLED),)
     points = [_mode_of(section) for section in sections]
     if not points:
         points = [MethodPoint(MethodStatus.ONE_SIDE, level) for level, _ in states.levels()]
@@ -44,7 +44,7 @@ def rct(data: SteadyStates, modes: LinearModes) -> MethodResult:
 
 
 def _mode_of(section: AmplitudeSection) -> MethodPoint:
-    """The linear mode of one section, by weighted least squares and once more near resonance."""
+    """The linear mode of one section, by weighted least squares, repeated near resonance."""
     if len(section.frequency) <= _UNKNOWNS:
         return MethodPoint(MethodStatus.TOO_FEW_STATES, section.level)
     eigenvalue, variance = _line(section.frequency, section.stiffness)
@@ -73,16 +73,22 @@ def _mode_of(section: AmplitudeSection) -> MethodPoint:
 def _line(frequency: np.ndarray, stiffness: np.ndarray) -> tuple[complex, float]:
     """λ of F/X = (λ − Ω²)/C, and the variance of its real and of its imaginary part."""
     center = float(np.mean(frequency**2))
-    # Relative errors of receptances weigh alike; squares about their mean keep the digits.
-    size = np.abs(stiffness)
-    design = np.stack([np.ones_like(frequency), -(frequency**2 - center)], axis=1) / size[:, None]
+    # Equal relative weights; subtracting the mean of Ω² avoids cancellation.
+    magnitude = np.abs(stiffness)
+    design = (
+        np.stack([np.ones_like(frequency), -(frequency**2 - center)], axis=1) / magnitude[:, None]
+    )
     scale = np.linalg.norm(design, axis=0)
-    solved, *_ = np.linalg.lstsq(design / scale, stiffness / size, rcond=None)
+    solved, *_ = np.linalg.lstsq(design / scale, stiffness / magnitude, rcond=None)
     numerator, inverse = solved / scale  # (λ − center)/C and 1/C
     eigenvalue = complex(center + numerator / inverse)
-    residual = stiffness / size - design @ np.array([numerator, inverse])
-    freedom = len(frequency) - _UNKNOWNS
-    noise = float(np.sum(np.abs(residual) ** 2) / (2 * freedom)) if freedom else np.nan
+    residual = stiffness / magnitude - design @ np.array([numerator, inverse])
+    degrees_of_freedom = len(frequency) - _UNKNOWNS
+    noise = (
+        float(np.sum(np.abs(residual) ** 2) / (2 * degrees_of_freedom))
+        if degrees_of_freedom
+        else np.nan
+    )
     covariance = np.linalg.inv(design.T @ design) * noise
     slope = np.array([1.0, -(eigenvalue - center)]) / inverse
     return eigenvalue, float(np.real(slope.conj() @ covariance @ slope))

@@ -1,1 +1,1 @@
-"""Structures ready made: beams and arches with known numbers, and from matrices."""
+"""Structures built from matrices, and published beams and arches."""

@@ -1,7 +1,7 @@
 """The two numerical beams of the method paper, as reduced-order models.
 
-Reference: Kwarta & Allen, Tabs. 2, 4 and A.1. The potential of the flat beam holds the means of
-the redundant entries of Tab. A.1 (relative spread at most 4.9e-4) with its labels put right:
+Reference: Kwarta & Allen, Tabs. 2, 4 and A.1. The potential of the flat beam has the means of
+the redundant entries of Tab. A.1 (relative spread at most 4.9e-4) with its labels corrected:
 row β_ij multiplies q_i² q_j, and the last four rows are 123, 124, 134 and 234. Participations are
 those of a uniform force on every free node.
 """
@@ -104,9 +104,9 @@ def flat_beam() -> Structure:
 def curved_beam(reading: Literal["monostable", "as_printed"] = "monostable") -> Structure:
     """The curved clamped-clamped beam: one mode with quadratic and cubic stiffness.
 
-    `as_printed` takes Tab. 4 to the letter and is bistable (saddle at q = 5.33e-5, second well
+    `as_printed` uses Tab. 4 as printed and is bistable (saddle at q = 5.33e-5, second well
     at 5.0e-4 kg^1/2 m). `monostable` has three times the cubic coefficient: it softens, then
-    stiffens, as the paper's text and figures say, and fits them rather than the print.
+    stiffens, in agreement with the paper's text and figures.
     One sensor, `midspan`. Raises `ValueError` for another reading.
     """
     factor = {"monostable": 3.0, "as_printed": 1.0}.get(reading)

@@ -10,29 +10,29 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from snrmjax.model.builders.free_coordinates import felt_first
+from snrmjax.model.attachment import InfluenceVector, influence_vector
+from snrmjax.model.builders.free_coordinates import coupled_first
 from snrmjax.model.builders.modal_damping import modal_damping
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce, checked_effects
-from snrmjax.model.modes import Beside, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.model.modes import LinearModesStd, OptionalModalData, RigidBodyModes, linear_modes
 from snrmjax.model.moving_base import BaseMotion
-from snrmjax.model.places import Row, row_over_points
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import POSITIVE, require
 
-_SYMMETRIC = 1e-8  # of the largest entry: what a finite-element program's output may miss by
-_RIGID = 1e-9  # of the largest of a few: natural frequencies squared below are of rigid motions
-_ROUNDING = 2e-14  # of the largest entry, for every unknown: what rounding leaves of zero
-_SMALL = 100  # unknowns, above which a few modes are found by themselves
-_MORE, _PASSES = 6, 4  # modes beside those wanted; shifts that are tried
-_DEPENDENT = 1e-10  # of its length: what is left of a vector that others already contain
+_SYMMETRIC = 1e-8  # of the largest entry: permitted asymmetry, as of finite-element output
+_RIGID = 1e-9  # of the largest of a few ω²: smaller ones belong to rigid-body modes
+_ROUNDING = 2e-14  # of the largest entry, per unknown: rounding error of a zero
+_SMALL = 100  # unknowns, above which a few modes are computed by Lanczos' method
+_MORE, _PASSES = 6, 4  # modes in addition to those wanted; number of shifts
+_DEPENDENT = 1e-10  # of its norm: remainder below which a vector is linearly dependent
 _DENSE = 2000  # unknowns, above which only the wanted modes are computed
 
 Phasor = float | complex
 
 
 class Matrices(NamedTuple):
-    """M ẍ + C ẋ + K x = f, as `from_matrices` takes it."""
+    """M ẍ + C ẋ + K x = f, the first arguments of `from_matrices`."""
 
     mass: Any  # kg
     damping: Any  # N s/m
@@ -56,30 +56,30 @@ def from_matrices(
     sensors: Sequence[str] | None = None,
     name: str = "structure",
 ) -> Structure:
-    """A structure from matrices, by its linear modes: M ẍ + C ẋ + K x + Σ effects = b F cos Ωt.
+    """A structure from matrices, in modal coordinates: M ẍ + C ẋ + K x + Σ effects = b F cos Ωt.
 
     Arguments: `mass` (kg), `damping` (N s/m) and `stiffness` (N/m) of shape (unknown, unknown),
-    dense or sparse of SciPy; `damping` may be a damping ratio of every mode instead, and None for
-    none. `points` names the unknowns ("x1", "x2", … by default). `force` is where the recorded
-    force acts: a point, or newtons per newton at points, complex where they lead by a phase.
-    `base` in its place: the structure stands on a base that moves, whose acceleration a acts as
-    the force −M r a, r being how far each unknown goes with the base (`base_motion`'s `along`); all
-    motion, that of the effects too, is relative to it.
-    `unbalance` (kg m) of something that turns: the force is U Ω² then, at the points of `force`.
-    `effects` act at points by their `at`, in N and m; the matrices hold no part of them.
-    `n_modes` keeps so many modes of lowest frequency, and for every place of an effect and for
-    the force one vector more: what the left out modes give way there statically, exactly, as
-    further modes of high frequency; without `residuals` it does not, as many places want it.
-    `sensors` are the points that are watched, by default all.
-    Damping that couples modes is kept. Modes without stiffness become rigid-body modes; those that
-    an effect acts on become modes of zero frequency, behind the others: masses without a linear
-    spring, which only nonlinear elements connect, as those of a nonlinear absorber.
+    dense or SciPy sparse; `damping` may also be one damping ratio for every mode, or None.
+    `points` names the unknowns ("x1", "x2", … by default). `force` is where the recorded force
+    acts: a point, or newtons per newton at points, complex for a phase lead.
+    `base` instead is base excitation: its acceleration a acts as the force −M r a, with r the
+    rigid-body displacement of each unknown per unit base displacement (`base_motion`'s `along`);
+    all motion, that of the effects too, is relative to the base.
+    `unbalance` (kg m) of a rotor: the force is then U Ω², at the points of `force`.
+    `effects` act at points by their `at`, in N and m, in addition to the matrices.
+    `n_modes` keeps that many modes of lowest frequency and, with `residuals`, one residual vector
+    for every attachment of an effect and for the force: the exact static flexibility of the
+    truncated modes, as additional modes of high frequency.
+    `sensors` are the measured points, by default all.
+    Damping that couples modes is kept. Modes without stiffness become rigid-body modes; those
+    that an effect acts on become modes of zero frequency, after the others: masses without a
+    linear spring, such as that of a nonlinear energy sink.
 
-    Returns a `Structure`. What `n_modes` leaves out is the dynamics of higher modes: a share of
-    about (Ω/ω)² of their static part, ω being the first frequency left out, for each harmonic Ω.
-    Raises `ValueError` for matrices that are not square, finite, symmetric, or of different sizes,
-    a mass that is not positive definite, a stiffness that is negative, unknown or repeated points,
-    a force or base that moves no mode, and both or none of them.
+    Returns a `Structure`. The truncation error of `n_modes` is about (Ω/ω)² of the static part of
+    the higher modes, with ω the first truncated natural frequency, for each harmonic Ω.
+    Raises `ValueError` for matrices that are not square, finite and symmetric, or of different
+    sizes, a mass that is not positive definite, a negative stiffness, unknown or repeated points,
+    a force or base that excites no mode, and both or neither of them.
     Reference: MacNeal, Comput. Struct. 1 (1971) 581, doi:10.1016/0045-7949(71)90031-9.
 
     >>> from snrmjax.model.effects import make_effect
@@ -96,24 +96,24 @@ def from_matrices(
     check_names(names, size)
     made = checked_effects(effects)
     forces = [effect for effect in made if isinstance(effect, AbstractForce)]
-    places = dict.fromkeys(row for e in forces for row in e.rows if row is not None)
-    rows = [_column(names, row, "an effect") for row in places]
+    attachments = dict.fromkeys(b for e in forces for b in e.rows if b is not None)
+    influence = [_column(names, b, "an effect") for b in attachments]
     load = _load(m, names, force, base)
     squared, shapes, rigid = _modes(m, k, n_modes)
     if n_modes is not None and residuals:
-        parts = [*rows, load.real, *([load.imag] if np.any(load.imag) else [])]
-        squared, shapes = _with_residuals(k, m, squared, shapes, rigid, parts)
+        loads = [*influence, load.real, *([load.imag] if np.any(load.imag) else [])]
+        squared, shapes = _with_residuals(k, m, squared, shapes, rigid, loads)
     n_flexible = len(squared)
-    if rigid.shape[1] and rows:
-        # What only elements hold moves with them, as an absorber without a linear spring does.
-        turn, n_free = felt_first(np.stack(rows) @ rigid, np.abs(rigid).max(axis=0))
-        free, rigid = np.split(rigid @ turn, [n_free], axis=1)
+    if rigid.shape[1] and influence:
+        # Motions constrained only by elements become modes of zero frequency, as of an energy sink.
+        rotation, n_free = coupled_first(np.stack(influence) @ rigid, np.abs(rigid).max(axis=0))
+        free, rigid = np.split(rigid @ rotation, [n_free], axis=1)
         squared, shapes = np.pad(squared, (0, n_free)), np.concatenate([shapes, free], axis=1)
     if not n_flexible or not np.any(load @ shapes):
         raise ValueError(
-            "the force acts where no mode of the structure moves."
+            "the force excites no mode of the structure."
             if base is None
-            else "the base moves no mode of the structure."
+            else "the base excites no mode of the structure."
         )
     omega = np.sqrt(squared)
     if damping is None or (np.ndim(damping) == 0 and not scipy.sparse.issparse(damping)):
@@ -124,19 +124,23 @@ def from_matrices(
         if c.shape != m.shape:
             raise ValueError(f"`damping` has shape {c.shape}, but there are {size} unknowns.")
         ratio, coupling, ratio_std = modal_damping(c, m, k, shapes, omega)
-    watched = tuple(sensors) if sensors is not None else names
-    seen = np.array(_places(names, watched, "`sensors`"))
-    unseen = np.setdiff1d(np.arange(size), seen).tolist()
-    other = {names[i]: shapes[i] for i in unseen}
-    acting = load @ shapes
+    measured = tuple(sensors) if sensors is not None else names
+    with_sensor = np.array(_indices(names, measured, "`sensors`"))
+    without_sensor = np.setdiff1d(np.arange(size), with_sensor).tolist()
+    other = {names[i]: shapes[i] for i in without_sensor}
+    participation = load @ shapes
     modes = linear_modes(
-        *(omega, ratio, shapes[seen], acting.real),
-        sensors=watched,
+        *(omega, ratio, shapes[with_sensor], participation.real),
+        sensors=measured,
         mode_of_interest=mode_of_interest,
-        rigid_body=RigidBodyModes(rigid[seen], (load @ rigid).real),
+        rigid_body=RigidBodyModes(rigid[with_sensor], (load @ rigid).real),
         std=LinearModesStd(damping_ratio=ratio_std),
-        beside=Beside(
-            other, coupling, -acting.imag if np.any(acting.imag) else None, base, unbalance
+        beside=OptionalModalData(
+            other,
+            coupling,
+            -participation.imag if np.any(participation.imag) else None,
+            base,
+            unbalance,
         ),
     )
     return structure(modes, effects=made, name=name)
@@ -148,17 +152,17 @@ def _load(
     force: str | Mapping[str, Phasor] | None,
     base: BaseMotion | None,
 ) -> np.ndarray:
-    """Newtons at the unknowns per newton, or per m/s² of the base."""
+    """Load vector: newtons at the unknowns per newton, or per m/s² of the base."""
     if (force is None) == (base is None):
-        raise ValueError("a structure has either a `force` or a `base` that moves.")
+        raise ValueError("a structure has either a `force` or a moving `base`.")
     if base is None:
         return _column(names, force or {}, "`force`")
-    _places(names, [point for point, _ in base.along], "the base's `along`")
+    _indices(names, [point for point, _ in base.along], "the base's `along`")
     return -(mass @ base.cosines(names))
 
 
 def _checked(name: str, matrix: Any) -> Any:
-    """A square symmetric matrix, dense up to a size and sparse beyond."""
+    """A checked square symmetric matrix, dense up to `_DENSE` unknowns."""
     if matrix is None:
         raise ValueError(f"`{name}` must be a matrix, but is missing.")
     sparse = scipy.sparse.issparse(matrix)
@@ -166,15 +170,15 @@ def _checked(name: str, matrix: Any) -> Any:
     if values.ndim != 2 or values.shape[0] != values.shape[1] or not values.shape[0]:
         raise ValueError(f"`{name}` must be a square matrix, but has shape {values.shape}.")
     require(f"`{name}`", values.data if sparse else values)
-    miss, largest = abs(values - values.T).max(), abs(values).max()
-    if miss > _SYMMETRIC * largest:
-        raise ValueError(f"`{name}` must be symmetric, but its two halves differ by {miss:g}.")
+    asymmetry, largest = abs(values - values.T).max(), abs(values).max()
+    if asymmetry > _SYMMETRIC * largest:
+        raise ValueError(f"`{name}` must be symmetric, but its two halves differ by {asymmetry:g}.")
     values = 0.5 * (values + values.T)
     return values.toarray() if sparse and values.shape[0] <= _DENSE else values
 
 
 def check_names(names: Sequence[str], size: int) -> None:
-    """Refuse names of points that are not as many as unknowns, or not different."""
+    """Refuse names of points whose number differs from the unknowns, or repeated ones."""
     if len(names) != size:
         raise ValueError(f"`points` names {len(names)} points, but there are {size} unknowns.")
     name, count = Counter(names).most_common(1)[0]
@@ -182,26 +186,28 @@ def check_names(names: Sequence[str], size: int) -> None:
         raise ValueError(f"`points` names {name!r} twice.")
 
 
-def _places(names: tuple[str, ...], points: Iterable[str], what: str) -> list[int]:
-    """Where points are among the unknowns."""
-    place = {name: k for k, name in enumerate(names)}
+def _indices(names: tuple[str, ...], points: Iterable[str], what: str) -> list[int]:
+    """Indices of points among the unknowns."""
+    index = {name: k for k, name in enumerate(names)}
     for point in points:
-        if point not in place:
+        if point not in index:
             near = suggestion(point, names) or f"; known are {', '.join(names[:12])}"
             raise ValueError(f"{what} names the point {point!r}, which does not exist{near}.")
-    return [place[point] for point in points]
+    return [index[point] for point in points]
 
 
-def _column(names: tuple[str, ...], at: str | Mapping[str, Phasor] | Row, what: str) -> np.ndarray:
-    """Weights of all unknowns; complex of a force with phases."""
-    weights = dict(at.items() if isinstance(at, Mapping) else row_over_points(at))
+def _column(
+    names: tuple[str, ...], at: str | Mapping[str, Phasor] | InfluenceVector, what: str
+) -> np.ndarray:
+    """Influence vector over all unknowns; complex for a force with phases."""
+    weights = dict(at.items() if isinstance(at, Mapping) else influence_vector(at))
     column = np.zeros(len(names), dtype=complex)
-    column[_places(names, weights, what)] = list(weights.values())
+    column[_indices(names, weights, what)] = list(weights.values())
     return column if np.any(column.imag) else column.real
 
 
 def _modes(m: Any, k: Any, n_modes: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Squared frequencies and mass-normalised shapes of flexible modes, and rigid-body shapes."""
+    """ω² and mass-normalised shapes of flexible modes, and shapes of rigid-body modes."""
     size = m.shape[0]
     wanted = size if n_modes is None else n_modes
     if not 1 <= wanted <= size:
@@ -220,22 +226,22 @@ def _modes(m: Any, k: Any, n_modes: int | None) -> tuple[np.ndarray, np.ndarray,
     if squared[0] < -rigid:
         raise ValueError(
             "`stiffness` must not be negative, but one of the squared natural frequencies is "
-            f"{squared[0]:g} 1/s²: what displacements are counted from is no stable position of "
-            "rest. Write the model about one, x = x₀ + y, where all springs together exert no "
-            "force: k x + c x³ with k < 0 rests at x₀ = √(−k/c), and has there the stiffness −2k, "
-            "a quadratic spring 3 c x₀ and the cubic spring c."
+            f"{squared[0]:g} 1/s²: zero displacement is an unstable equilibrium. Write the model "
+            "about a stable one, x = x₀ + y, where all spring forces balance: k x + c x³ with "
+            "k < 0 rests at x₀ = √(−k/c), and has there the stiffness −2k, a quadratic spring "
+            "3 c x₀ and the cubic spring c."
         )
     shapes = shapes * np.where(shapes[np.argmax(np.abs(shapes), 0), range(len(order))] < 0, -1, 1)
-    floats = squared <= rigid
-    keep = np.flatnonzero(~floats)[:wanted]
-    return squared[keep], shapes[:, keep], shapes[:, floats]
+    is_rigid = squared <= rigid
+    keep = np.flatnonzero(~is_rigid)[:wanted]
+    return squared[keep], shapes[:, keep], shapes[:, is_rigid]
 
 
 def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
-    """The lowest modes by Lanczos' method on the inverse, rigid-body modes among them.
+    """The lowest modes by shift-invert Lanczos, rigid-body modes included.
 
-    A shift as large as the lowest natural frequency squared loses no digits of it; one that is far
-    larger, as entries of a fine mesh suggest, loses all.
+    A shift of the order of the lowest ω² costs no digits; a far larger one, as estimated from the
+    entries of a fine mesh, costs all. The shift is therefore reduced in several passes.
     """
     springs = abs(k.diagonal())
     entries = springs[springs > 0].min() / abs(m.diagonal()).max()
@@ -252,7 +258,7 @@ def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
         except RuntimeError as error:
             raise ValueError(
                 "the lowest modes are lost to rounding: the mesh is too fine for these matrices, "
-                "or `stiffness` and `mass` have motions in common that neither holds."
+                "or `stiffness` and `mass` have a common null space."
             ) from error
         flexible = squared[squared > _RIGID * squared.max()]
         if shifts[-1] == 0 or -shifts[-1] < 0.2 * flexible.min():
@@ -277,9 +283,9 @@ class _Inverse:
             upper, order, _ = scipy.linalg.lapack.dgetrf(matrix)
             self.solve = lambda right: scipy.linalg.lapack.dgetrs(upper, order, right)[0]
             pivots = np.diag(upper)
-        size = np.abs(pivots)
-        # A motion without a force leaves a pivot of rounding.
-        self.regular = bool(size.min() > _ROUNDING * size.max())
+        magnitude = np.abs(pivots)
+        # A rigid-body motion leaves a pivot of the order of rounding.
+        self.regular = bool(magnitude.min() > _ROUNDING * magnitude.max())
 
 
 def _dense(matrix: Any) -> np.ndarray:
@@ -294,30 +300,33 @@ def _with_residuals(
     rigid: np.ndarray,
     loads: list[np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The modes, and what the left out ones give way statically under unit loads, as modes."""
+    """The modes with residual vectors: static response of the truncated modes to unit loads."""
     if shapes.shape[1] + rigid.shape[1] >= len(shapes):
         return squared, shapes
     kept = np.concatenate([rigid, shapes], axis=1)
     columns = np.stack(loads, axis=1)
-    columns = columns - m @ (kept @ (kept.T @ columns))  # nothing that the kept modes carry
+    columns = columns - m @ (kept @ (kept.T @ columns))  # orthogonal to the kept modes
     stiffness: Any = k
     right = columns
-    if rigid.shape[1]:  # further equations fix the rigid motion, which these loads do not drive
-        held = m @ rigid * (np.abs(k.diagonal()).max() / np.abs(m @ rigid).max())
+    if rigid.shape[1]:  # constraints fix the rigid-body motion, which these loads do not excite
+        constraint = m @ rigid * (np.abs(k.diagonal()).max() / np.abs(m @ rigid).max())
         sparse = scipy.sparse.issparse(k)
-        rows = [[k, held], [held.T, None if sparse else np.zeros((rigid.shape[1],) * 2)]]
-        stiffness = scipy.sparse.block_array(rows, format="csc") if sparse else np.block(rows)
+        blocks = [
+            [k, constraint],
+            [constraint.T, None if sparse else np.zeros((rigid.shape[1],) * 2)],
+        ]
+        stiffness = scipy.sparse.block_array(blocks, format="csc") if sparse else np.block(blocks)
         right = np.pad(columns, ((0, rigid.shape[1]), (0, 0)))
-    ways = _Inverse(stiffness).solve(right)[: len(shapes)]
+    deflections = _Inverse(stiffness).solve(right)[: len(shapes)]
     vectors = np.zeros((len(shapes), 0))
-    for way in ways.T:
-        left = way
-        for _ in range(2):  # once more against rounding
+    for deflection in deflections.T:
+        vector = deflection
+        for _ in range(2):  # reorthogonalised against rounding
             for basis in (kept, vectors):
-                left = left - basis @ (basis.T @ (m @ left))
-        length, whole = np.sqrt(left @ (m @ left)), np.sqrt(way @ (m @ way))
-        if length > _DEPENDENT * max(whole, np.finfo(float).tiny):
-            vectors = np.column_stack([vectors, left / length])
+                vector = vector - basis @ (basis.T @ (m @ vector))
+        norm, whole = np.sqrt(vector @ (m @ vector)), np.sqrt(deflection @ (m @ deflection))
+        if norm > _DEPENDENT * max(whole, np.finfo(float).tiny):
+            vectors = np.column_stack([vectors, vector / norm])
     if not vectors.shape[1]:
         return squared, shapes
     values, mixed = np.linalg.eigh(vectors.T @ (k @ vectors))
@@ -329,11 +338,11 @@ def chain(
     springs: Sequence[float] | Float[np.ndarray, " spring"],
     dampers: Sequence[float] | Float[np.ndarray, " spring"] | float = 0.0,
 ) -> Matrices:
-    """Masses in a row between two walls; their points are "x1", "x2", ….
+    """A spring–mass chain between two walls; its points are "x1", "x2", ….
 
     Arguments: `masses` in kg; `springs` in N/m and `dampers` in N s/m, one more than masses: wall
-    to first, first to second, …, last to wall (0 for none). One number of `dampers` is for all.
-    Raises `ValueError` for numbers that do not fit together.
+    to first, first to second, …, last to wall (0 for none). A scalar `dampers` applies to all.
+    Raises `ValueError` for inconsistent lengths.
 
     >>> chain([1.0, 2.0], [3.0, 4.0, 0.0]).stiffness
     array([[ 7., -4.],
@@ -365,14 +374,14 @@ def beam(
     stiffness_damping: float = 0.0,
     mass_damping: float = 0.0,
 ) -> Matrices:
-    """A straight beam in bending by Euler and Bernoulli's elements, with consistent masses.
+    """A straight beam in bending by Euler–Bernoulli elements with consistent mass matrices.
 
     The points are the deflections "w0", "w1", …, "w`n_elements`" (m) and the slopes "r0", "r1", …
-    (rad) of the nodes, but for those that `supports` hold: "clamped", "pinned" or "free" at either
-    end. `springs` (N/m) stand at points, linear; the damping is `mass_damping` (1/s) times the mass
-    and `stiffness_damping` (s) times the stiffness of the beam without springs.
+    (rad) of the nodes, without those fixed by `supports`: "clamped", "pinned" or "free" at either
+    end. `springs` (N/m) are linear springs to ground at points; the damping is `mass_damping` (1/s)
+    times the mass and `stiffness_damping` (s) times the stiffness of the beam without springs.
     Arguments: `bending_stiffness` E I in N m², `mass_per_length` ρ A in kg/m, `length` in m.
-    Raises `ValueError` for numbers that cannot be and unknown supports.
+    Raises `ValueError` for numbers that are not positive and unknown supports.
 
     >>> model = from_matrices(*beam(174.3, 0.78, 0.5, 20), force="w20")
     >>> round(float(model.modes.natural_frequency[0]), 2)  # 1.8751²/l² √(E I/ρ A)
@@ -391,21 +400,21 @@ def beam(
     size = 2 * n_elements + 2
     mass, stiffness = np.zeros((size, size)), np.zeros((size, size))
     for k in range(n_elements):
-        here = slice(2 * k, 2 * k + 4)
-        mass[here, here] += mass_per_length * h / 420 * inertia
-        stiffness[here, here] += bending_stiffness / h**3 * bending
+        dofs = slice(2 * k, 2 * k + 4)
+        mass[dofs, dofs] += mass_per_length * h / 420 * inertia
+        stiffness[dofs, dofs] += bending_stiffness / h**3 * bending
     mass, stiffness = (np.triu(part) + np.triu(part, 1).T for part in (mass, stiffness))
     names = [f"{kind}{k}" for k in range(n_elements + 1) for kind in "wr"]
-    held = {"clamped": 2, "pinned": 1, "free": 0}
+    fixed = {"clamped": 2, "pinned": 1, "free": 0}
     for end in supports:
-        if end not in held:
+        if end not in fixed:
             raise ValueError(f"`supports` must be clamped, pinned or free, but has {end!r}.")
-    gone = [*range(held[supports[0]]), *(size - 2 + k for k in range(held[supports[1]]))]
-    keep = np.setdiff1d(np.arange(size), gone)
+    removed = [*range(fixed[supports[0]]), *(size - 2 + k for k in range(fixed[supports[1]]))]
+    keep = np.setdiff1d(np.arange(size), removed)
     mass, stiffness = mass[np.ix_(keep, keep)], stiffness[np.ix_(keep, keep)]
     points = tuple(names[k] for k in keep)
     damping = mass_damping * mass + stiffness_damping * stiffness
     for point, value in (springs or {}).items():
-        (place,) = _places(points, [point], "`springs`")
-        stiffness[place, place] += value
+        (dof,) = _indices(points, [point], "`springs`")
+        stiffness[dof, dof] += value
     return Matrices(mass, damping, stiffness, points)

@@ -1,4 +1,4 @@
-"""Damping of modes from a damping matrix, without loss of digits on fine meshes."""
+"""Modal damping from a damping matrix, without loss of digits on fine meshes."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,103 +6,107 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-_OVERDAMPED = 0.99  # damping ratio, beyond which the rest counts as coupling
+_OVERDAMPED = 0.99  # largest damping ratio; the rest counts as coupling
 _NO_COUPLING = 1e-12  # of the damping of both modes
-_ROUNDED = (4e-16, 2e-15)  # of its parts, for one and for two: what rounding makes of a damping
-_ENTRIES, _TRIALS = 100_000, 200  # looked at, and pairs of them that are tried, for that
-_NOTED = 1e-6  # of a modal damping, the rounding of entries that is stated as its 1σ
-_LOWEST, _CAUTION = 10, 0.5  # modes that lose most; the error over the sum of all roundings
-_CANCELLED = 1e-8  # of a modal damping: what rounding may do to it
-_SLICES = 3  # of the digits of numbers that are multiplied without rounding
+_ROUNDED = (4e-16, 2e-15)  # relative rounding error of a damping with one and with two parts
+_ENTRIES, _TRIALS = 100_000, 200  # entries sampled, and pairs of them solved for a and b
+_NOTED = 1e-6  # of a modal damping: rounding error above which it is stated as 1σ
+_LOWEST, _CAUTION = 10, 0.5  # modes most affected; 1σ over the sum of all rounding errors
+_CANCELLED = 1e-8  # of a modal damping: permitted rounding error
+_SLICES = 3  # of the digits in products without rounding
 
 
 def modal_damping(
     damping: Any, mass: Any, stiffness: Any, shapes: np.ndarray, omega: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Damping ratios, what of the modal damping matrix they do not hold, and 1σ of the ratios.
+    """Damping ratios, the remaining coupling of the modal damping matrix, and 1σ of the ratios.
 
     Arguments: the symmetric matrices, dense or sparse, mass-normalised `shapes` and their
-    frequencies in rad/s, zero of those without stiffness.
+    frequencies in rad/s, zero for those without stiffness.
     """
-    # What is proportional to mass and stiffness is known from the frequencies. As a product with
-    # the shapes it would be a small difference of large numbers on a fine mesh.
+    # The proportional part follows exactly from the frequencies: Φᵀ(aM + bK)Φ = a + bω². As a
+    # product with the shapes it is a small difference of large numbers on a fine mesh.
     by_mass, by_stiffness, rest = _proportional(damping, mass, stiffness)
     modal = np.diag(by_mass + by_stiffness * omega**2) + _modal(rest, shapes)
     own = np.diag(modal)
     twice = np.where(omega > 0, 2 * omega, np.inf)
     ratio = np.minimum(own / twice, _OVERDAMPED)
-    std, some = np.zeros(len(own)), slice(_LOWEST)
-    miss = _rounding(damping if by_mass and by_stiffness else rest, shapes[:, some]) / twice[some]
-    std[some] = np.where(miss > _NOTED * ratio[some], miss, 0.0)
+    std, lowest = np.zeros(len(own)), slice(_LOWEST)
+    error = (
+        _rounding(damping if by_mass and by_stiffness else rest, shapes[:, lowest]) / twice[lowest]
+    )
+    std[lowest] = np.where(error > _NOTED * ratio[lowest], error, 0.0)
     rest = modal - np.diag(2 * ratio * omega)
-    least = _NO_COUPLING * np.sqrt(np.abs(np.outer(own, own)))
-    return ratio, rest if np.any(np.abs(rest) > least) else None, std
+    threshold = _NO_COUPLING * np.sqrt(np.abs(np.outer(own, own)))
+    return ratio, rest if np.any(np.abs(rest) > threshold) else None, std
 
 
 def _rounding(matrix: Any, shapes: np.ndarray) -> np.ndarray:
-    """1σ of modal dampings, 1/s, by the rounding of a matrix's entries.
+    """1σ of modal dampings, 1/s, from the rounding of the matrix entries.
 
-    A sum of mass and stiffness of a fine mesh keeps few digits of them, whatever computes them.
+    A stored sum of mass and stiffness of a fine mesh has few digits of the modal damping.
     """
     terms = np.sum(np.abs(shapes) * (abs(matrix) @ np.abs(shapes)), axis=0)
     return _CAUTION * np.finfo(float).eps * terms
 
 
 def _proportional(damping: Any, mass: Any, stiffness: Any) -> tuple[float, float, Any]:
-    """a and b of the part a M + b K of a damping matrix, and the rest without what is rounding.
+    """a and b of the part a M + b K of a damping matrix, and the rest above rounding errors.
 
-    The simplest pair that nine entries of ten have, to rounding: b alone, a alone, both. Where none
-    is, both are zero.
+    The simplest pair that agrees with nine of ten entries, to rounding: b alone, a alone, both. If
+    there is none, both are zero.
     """
     row, column = (abs(damping) + abs(mass) + abs(stiffness)).nonzero()
-    draw = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     if len(row) > _ENTRIES:
-        some = draw.choice(len(row), _ENTRIES, replace=False)
-        some = np.append(some, np.flatnonzero(row == column))
-        row, column = row[some], column[some]
+        sampled = rng.choice(len(row), _ENTRIES, replace=False)
+        sampled = np.append(sampled, np.flatnonzero(row == column))
+        row, column = row[sampled], column[sampled]
     c, m, k = (np.asarray(part[row, column]).ravel() for part in (damping, mass, stiffness))
-    for a, b in _candidates(c, m, k, draw):
+    for a, b in _candidates(c, m, k, rng):
         rest = damping - a * mass - b * stiffness
-        size = abs(damping.diagonal()) + abs(a * mass.diagonal()) + abs(b * stiffness.diagonal())
-        rounding = _ROUNDED[bool(a and b)] * np.sqrt(size)
-        left = np.asarray(rest[row, column]).ravel()
-        if np.count_nonzero(np.abs(left) > rounding[row] * np.sqrt(size[column])) < 0.1 * len(c):
+        scale = abs(damping.diagonal()) + abs(a * mass.diagonal()) + abs(b * stiffness.diagonal())
+        rounding = _ROUNDED[bool(a and b)] * np.sqrt(scale)
+        sampled_rest = np.asarray(rest[row, column]).ravel()
+        if np.count_nonzero(
+            np.abs(sampled_rest) > rounding[row] * np.sqrt(scale[column])
+        ) < 0.1 * len(c):
             if scipy.sparse.issparse(rest):
                 rest = rest.tocoo()
-                kept = np.abs(rest.data) > rounding[rest.row] * np.sqrt(size[rest.col])
+                kept = np.abs(rest.data) > rounding[rest.row] * np.sqrt(scale[rest.col])
                 at = (rest.row[kept], rest.col[kept])
                 return a, b, scipy.sparse.csr_array((rest.data[kept], at), rest.shape)
-            return a, b, np.where(np.abs(rest) > rounding[:, None] * np.sqrt(size), rest, 0.0)
+            return a, b, np.where(np.abs(rest) > rounding[:, None] * np.sqrt(scale), rest, 0.0)
     return 0.0, 0.0, damping
 
 
 def _candidates(
-    c: np.ndarray, m: np.ndarray, k: np.ndarray, draw: np.random.Generator
+    c: np.ndarray, m: np.ndarray, k: np.ndarray, rng: np.random.Generator
 ) -> Iterator[tuple[float, float]]:
-    """Pairs a, b of c = a m + b k: by b alone, by a alone, by both as most entries have it."""
+    """Pairs a, b of c = a m + b k: by b alone, by a alone, by the pair most entries agree on."""
     yield 0.0, float(np.median(c[k != 0] / k[k != 0])) if np.any(k) else 0.0
     yield float(np.median(c[m != 0] / m[m != 0])), 0.0
     best, agreed = None, 0
-    for one, two in draw.integers(0, len(c), (_TRIALS, 2)):
+    for one, two in rng.integers(0, len(c), (_TRIALS, 2)):
         determinant = m[one] * k[two] - m[two] * k[one]
         if abs(determinant) <= 1e-6 * (abs(m[one] * k[two]) + abs(m[two] * k[one])):
             continue
         a = (c[one] * k[two] - c[two] * k[one]) / determinant
         b = (m[one] * c[two] - m[two] * c[one]) / determinant
-        size = np.abs(c) + np.abs(a * m) + np.abs(b * k)
-        same = (np.abs(c - a * m - b * k) <= 1e-8 * size) & (size > 0)
+        scale = np.abs(c) + np.abs(a * m) + np.abs(b * k)
+        same = (np.abs(c - a * m - b * k) <= 1e-8 * scale) & (scale > 0)
         if np.count_nonzero(same) > agreed:
-            best, agreed = (same, size), int(np.count_nonzero(same))
+            best, agreed = (same, scale), int(np.count_nonzero(same))
     if best is not None:
-        same, size = best
-        rows = np.stack([m[same], k[same]], axis=1) / size[same, None]
-        length = np.linalg.norm(rows, axis=0)
-        a, b = np.linalg.lstsq(rows / length, c[same] / size[same], rcond=1e-15)[0] / length
+        same, scale = best
+        rows = np.stack([m[same], k[same]], axis=1) / scale[same, None]
+        norm = np.linalg.norm(rows, axis=0)
+        a, b = np.linalg.lstsq(rows / norm, c[same] / scale[same], rcond=1e-15)[0] / norm
         yield float(a), float(b)
 
 
 def _modal(matrix: Any, shapes: np.ndarray) -> np.ndarray:
-    """ΦᵀAΦ, the products AΦ to more than double precision where large terms cancel in them."""
+    """ΦᵀAΦ, with AΦ in more than double precision if large terms cancel."""
     if not (matrix.nnz if scipy.sparse.issparse(matrix) else np.any(matrix)):
         return np.zeros((shapes.shape[1],) * 2)
     product = matrix @ shapes
@@ -114,9 +118,9 @@ def _modal(matrix: Any, shapes: np.ndarray) -> np.ndarray:
 
 
 def _exact_product(matrix: Any, columns: np.ndarray) -> np.ndarray:
-    """A matrix times columns, as sums of products that are exact.
+    """A matrix times columns, as sums of exact products.
 
-    Both are cut into slices of so few binary digits that sums of their products have no rounding.
+    Both are split into slices of so few binary digits that sums of their products are exact.
     Reference: Ozaki et al., Numer. Algorithms 59 (2012) 95, doi:10.1007/s11075-011-9478-1.
     """
     sparse = scipy.sparse.issparse(matrix)
@@ -124,7 +128,7 @@ def _exact_product(matrix: Any, columns: np.ndarray) -> np.ndarray:
     digits = (53 - int(np.ceil(np.log2(terms + 1)))) // 2
 
     def slices(values: np.ndarray, largest: np.ndarray) -> list[np.ndarray]:
-        """The values, by slices of so many digits below the power of two above the largest."""
+        """The values as slices of `digits` bits below the power of two above the largest."""
         unit = 2.0 ** np.ceil(np.log2(np.where(largest > 0, largest, 1.0)))
         parts = []
         for number in range(1, _SLICES + 1):

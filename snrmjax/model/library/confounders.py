@@ -1,24 +1,24 @@
-"""Effects of the library that measured states may not tell apart, and what separates them."""
+"""Effects of the library that measured states may not distinguish, and what separates them."""
 
 from snrmjax.model.effect_metadata import Confounder
 
-TOLD_BY_MEAN_OR_SECOND_HARMONIC = Confounder(
+SEPARATED_BY_MEAN_OR_SECOND_HARMONIC = Confounder(
     "record harmonic 2 or the mean displacement at the largest level"
 )
 ONE_SIDED_OR_TWO_SIDED = Confounder(
-    "record harmonic 2 at the largest level: only a one-sided contact makes it"
+    "record harmonic 2 at the largest level: only a one-sided contact generates it"
 )
-TOLD_BY_THIRD_HARMONIC = Confounder(
-    "record harmonic 3 at the largest level, whose sign and size differ, and widen the range of "
-    "levels"
+SEPARATED_BY_THIRD_HARMONIC = Confounder(
+    "record harmonic 3 at the largest level, whose sign and amplitude differ, and widen the range "
+    "of levels"
 )
 STRUCTURE_OR_FORCE_SPECTRUM = Confounder(
     "record harmonic 2 against level and the force's own spectrum"
 )
-SIZE_OF_RESPONSE = Confounder(
+RESPONSE_SCALE = Confounder(
     "calibrate force and velocity statically, or repeat a level with a known added mass"
 )
-FORCE_OR_SENSOR_GAIN = Confounder(SIZE_OF_RESPONSE.separated_by, by_calibration=True)
+FORCE_OR_SENSOR_GAIN = Confounder(RESPONSE_SCALE.separated_by, by_calibration=True)
 STIFFNESS_OR_MASS = Confounder("add a known mass, or measure a second mode", by_calibration=True)
 FRICTION_OR_FORCE_OFFSET = Confounder(
     "measure at the smallest level 30° and more off resonance, on both sides"
@@ -37,8 +37,8 @@ WHICH_RESONANCE = Confounder(
 )
 
 CONFOUNDERS = (
-    *(TOLD_BY_MEAN_OR_SECOND_HARMONIC, ONE_SIDED_OR_TWO_SIDED, TOLD_BY_THIRD_HARMONIC),
-    *(STRUCTURE_OR_FORCE_SPECTRUM, SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN, STIFFNESS_OR_MASS),
+    *(SEPARATED_BY_MEAN_OR_SECOND_HARMONIC, ONE_SIDED_OR_TWO_SIDED, SEPARATED_BY_THIRD_HARMONIC),
+    *(STRUCTURE_OR_FORCE_SPECTRUM, RESPONSE_SCALE, FORCE_OR_SENSOR_GAIN, STIFFNESS_OR_MASS),
     *(FRICTION_OR_FORCE_OFFSET, DRIFT, FAR_MODE_OR_PHASE_ERROR, FURTHER_MODE, WHICH_RESONANCE),
 )
-"""In the order in which their measurements are asked for: recordings first, further tests last."""
+"""In the order in which their measurements are proposed: recordings first, further tests last."""

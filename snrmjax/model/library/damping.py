@@ -1,4 +1,4 @@
-"""Damping forces without memory: drag and other laws of the velocity."""
+"""Memoryless damping forces: drag and other functions of the velocity."""
 
 from typing import ClassVar
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.model.effect_base import AbstractMemoryless, Scalar
 from snrmjax.model.effect_metadata import (
-    NOT_BELOW_ZERO,
+    NON_NEGATIVE,
     Argument,
     Confounder,
     Part,
@@ -15,7 +15,7 @@ from snrmjax.model.effect_metadata import (
     Symmetry,
     parameter,
 )
-from snrmjax.model.library.confounders import TOLD_BY_THIRD_HARMONIC
+from snrmjax.model.library.confounders import SEPARATED_BY_THIRD_HARMONIC
 
 _OF_VELOCITY = Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY)
 
@@ -25,13 +25,13 @@ class QuadraticDamping(AbstractMemoryless):
 
     kind: ClassVar[str] = "quadratic_damping"
     description: ClassVar[str] = (
-        "Drag of the surrounding air or liquid: a damping force with the square of the velocity."
+        "Drag of the surrounding air or liquid: a damping force quadratic in the velocity."
     )
     shape: ClassVar[Shape] = _OF_VELOCITY._replace(
         power=1, factor=8 / (3 * np.pi), frequency_power=2
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_THIRD_HARMONIC,)
-    coefficient: Scalar = parameter("1/(kg^1/2 m)", "quadratic damping", prior=NOT_BELOW_ZERO)
+    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_THIRD_HARMONIC,)
+    coefficient: Scalar = parameter("1/(kg^1/2 m)", "quadratic damping", prior=NON_NEGATIVE)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         return self.coefficient * jnp.abs(velocity) * velocity
@@ -42,10 +42,10 @@ class CubicDamping(AbstractMemoryless):
 
     kind: ClassVar[str] = "cubic_damping"
     description: ClassVar[str] = (
-        "A damping force with the third power of the velocity, as of some dampers and seals."
+        "A damping force cubic in the velocity, as of some dampers and seals."
     )
     shape: ClassVar[Shape] = _OF_VELOCITY._replace(power=2, factor=0.75, frequency_power=3)
-    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_THIRD_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("s/(kg m²)", "cubic damping")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -58,12 +58,12 @@ class VanDerPolDamping(AbstractMemoryless):
     kind: ClassVar[str] = "van_der_pol_damping"
     description: ClassVar[str] = (
         "Damping that grows with the square of the displacement, as of a material under large "
-        "strain; below zero, a feedback that feeds the motion."
+        "strain; below zero, a self-excitation."
     )
     shape: ClassVar[Shape] = Shape(
         *(Part.DAMPING, Symmetry.ODD, Argument.BOTH), power=2, factor=0.25, frequency_power=1
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_THIRD_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg m² s)", "damping per squared displacement")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:

@@ -1,10 +1,10 @@
-"""Friction: forces that depend on the history of the motion, and on its direction.
+"""Friction: forces that depend on the history and the direction of the motion.
 
 A slider with the stuck stiffness k_t and the slip displacement x_s is a spring k_t to a block
-that rests on a friction surface. The block's position z is pushed along where the spring's
-stretch q − z would exceed ±x_s (the "play" of q). On the mode of interest the linear frequency is
-that of the stuck structure, so that a slider adds k_t (q − z) − k_t q = −k_t z: nothing before the
-first slip. At points it is the whole force k_t (x − z), of which the structure holds no part.
+on a friction surface. The block's position z follows where the spring's stretch q − z would
+exceed ±x_s (the "play" of q). On the mode of interest the linear frequency is that of the stuck
+structure, so that a slider adds k_t (q − z) − k_t q = −k_t z: nothing before the first slip. At
+points it is the whole force k_t (x − z), with no part in the linear structure.
 
 Reference: Iwan, ASME J. Appl. Mech. 33 (1966), 893, doi:10.1115/1.3625199.
 """
@@ -28,7 +28,7 @@ from snrmjax.model.effect_base import (
     States,
 )
 from snrmjax.model.effect_metadata import (
-    NOT_BELOW_ZERO,
+    NON_NEGATIVE,
     Argument,
     Confounder,
     MotionScales,
@@ -43,13 +43,13 @@ from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE
 
 _SLIP = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
 SMOOTHING = 0.05  # width of the smoothed jump of Coulomb's force over the rms velocity
-# In w = u^(p−1) on (0, 1), where the thresholds of an Iwan element are evenly dense.
+# In w = u^(p−1) on (0, 1), in which the slip thresholds of an Iwan element have uniform density.
 NODE, WEIGHT = (0.5 * part for part in np.polynomial.legendre.leggauss(48))
 NODE = NODE + 0.5
 
 
 class Sliders(NamedTuple):
-    """Sliders side by side."""
+    """Parallel sliders."""
 
     stiffness: Float[Array, " slider"]  # k_t, 1/s²
     slip_displacement: Float[Array, " slider"]  # x_s, kg^1/2 m
@@ -62,10 +62,10 @@ def settled_positions(
 
     z ↦ clip(z, q − x_s, q + x_s) from sample to sample, from z = 0. Such maps are closed under
     composition, and that of a whole cycle is idempotent: the second cycle is exactly the steady
-    one. A slider that never slips stays where the first approach from rest to sample 0 left it.
+    one. A slider that never slips stays where the first loading from rest to sample 0 left it.
 
-    Every position is a sample of q plus or minus x_s, or 0. Which sample it is, is found without
-    derivatives; the position is then looked up, so that its derivatives are exact and cheap.
+    Every position is a sample of q plus or minus x_s, or 0. The index of the sample is computed
+    without derivatives and the position then looked up: exact and cheap derivatives.
     """
     n = displacement.shape[0]
     q, slip = jax.lax.stop_gradient((displacement, slip_displacement))
@@ -92,7 +92,7 @@ def settled_positions(
 def slipped_position(
     displacement: Float[Array, " time"], slip_displacement: Float[Array, " slider"]
 ) -> Float[Array, "time slider"]:
-    """`settled_positions` of a cycle between two turning points; NaN where there are more."""
+    """`settled_positions` of a cycle with two turning points; NaN with more."""
     slip, q = slip_displacement, displacement[:, None]
     high, low, falling = _turning_points(displacement)
     down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
@@ -101,16 +101,16 @@ def slipped_position(
 
 
 class AbstractSliders(AbstractHysteresis):
-    """Friction by sliders side by side; the states are their positions in kg^1/2 m."""
+    """Friction by parallel sliders; the states are their positions in kg^1/2 m."""
 
     held_in_steps: ClassVar[bool] = True
 
     @abstractmethod
     def sliders(self) -> Sliders:
-        """The sliders, for integration in time."""
+        """The sliders, for time integration."""
 
     def added_stiffness(self) -> Scalar:
-        """What the stuck sliders add to the structure: of a force at points all their springs."""
+        """Stiffness that the stuck sliders add to the structure: all their springs, at points."""
         return jnp.zeros(()) if self.at is None else jnp.sum(self.sliders().stiffness)
 
     def stuck_stiffness(self) -> Float[Array, " row"]:
@@ -123,29 +123,29 @@ class AbstractSliders(AbstractHysteresis):
         return self.moved_states(displacement, self.initial_states())
 
     def state_force(self, displacement: Scalar, velocity: Scalar, states: States) -> Scalar:
-        """Errors of an integrator's positions are removed."""
+        """The force with the integrator's position errors removed."""
         lost = jnp.sum(self.sliders().stiffness * self.moved_states(displacement, states))
         return self.added_stiffness() * displacement - lost
 
     def state_rate(self, displacement: Scalar, velocity: Scalar, states: States) -> States:
-        """The velocity q̇ while a slider is dragged, otherwise 0."""
+        """The velocity q̇ while a slider slips, otherwise 0."""
         stretch, slip = displacement - states, self.sliders().slip_displacement
         dragged = jnp.where(velocity > 0, stretch >= slip, stretch <= -slip)
         return jnp.where(dragged, velocity, 0.0)
 
     def moved_states(self, displacement: Scalar, states: States) -> States:
-        """Positions after q went to `displacement` without turning: exact, unlike an integrator."""
+        """Positions after a monotonic motion to `displacement`: exact, unlike an integrator's."""
         slip = self.sliders().slip_displacement
         return jnp.clip(states, displacement - slip, displacement + slip)
 
     def after_step(
         self, states: States, begin: tuple[Array, Array], end: tuple[Array, Array], time: Array
     ) -> States:
-        """Positions after a step, a turning point within which is passed."""
+        """Positions after a step, including a turning point within it."""
         (x0, v0), (x1, v1) = begin, end
-        turns = v0 * v1 < 0
-        until = time * v0 / jnp.where(turns, v0 - v1, 1.0)
-        turning = jnp.where(turns, x0 + 0.5 * v0 * until, x0)
+        reverses = v0 * v1 < 0
+        until = time * v0 / jnp.where(reverses, v0 - v1, 1.0)
+        turning = jnp.where(reverses, x0 + 0.5 * v0 * until, x0)
         return self.moved_states(x1, self.moved_states(turning, states))
 
     def settled_states(
@@ -157,11 +157,11 @@ class AbstractSliders(AbstractHysteresis):
         return self.for_cycle(displacement)._force_on(displacement, settled_positions)
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """Over a cycle between two turning points."""
+        """For a cycle with two turning points."""
         return self.for_cycle(displacement)._force_on(displacement, slipped_position)
 
     def for_cycle(self, displacement: Samples) -> Self:
-        """The sliders that resolve a cycle; the effect itself where they do not depend on it."""
+        """The effect with sliders that resolve a cycle; itself if they do not depend on it."""
         return self
 
     def _force_on(self, displacement: Samples, positions: Callable[..., Array]) -> Samples:
@@ -179,12 +179,12 @@ class JenkinsSlider(AbstractSliders):
 
     kind: ClassVar[str] = "jenkins_slider"
     description: ClassVar[str] = (
-        "A joint that sticks and, beyond a certain displacement, slips as a whole: it then loses "
+        "A joint that sticks and, beyond a certain displacement, slips completely: it then loses "
         "stiffness and dissipates energy."
     )
     shape: ClassVar[Shape] = _SLIP
     stiffness: Scalar = parameter(
-        "1/s²", "stiffness while it sticks", rules=(NOT_NEGATIVE,), prior=NOT_BELOW_ZERO
+        "1/s²", "stiffness while it sticks", rules=(NOT_NEGATIVE,), prior=NON_NEGATIVE
     )
     slip_displacement: Scalar = parameter(
         *("kg^1/2 m", "displacement at slip"),
@@ -194,7 +194,7 @@ class JenkinsSlider(AbstractSliders):
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """Slip at several shares of the largest amplitude."""
+        """Slip at several fractions of the largest amplitude."""
         fractions = (0.05, 0.15, 0.3, 0.5, 0.75)
         return [(3.0 * scales.change, fraction * scales.largest) for fraction in fractions]
 
@@ -203,28 +203,28 @@ class JenkinsSlider(AbstractSliders):
 
 
 class IwanMicroslip(AbstractSliders):
-    """Microslip of a joint: backbone −c|x|^p sgn x and Masing's rule, by many sliders.
+    """Microslip of a joint: backbone −c|x|^p sgn x and Masing's rule, by a continuum of sliders.
 
     Sliders with every slip displacement s and the stiffness density c p (p − 1) s^(p−2):
     f = −∫₀^R c p (p − 1) s^(p−2) z_s ds, where R is half the range of q over the cycle; sliders
     above R do not slip and, being part of the linear frequency, add nothing. By Gauss's rule
     with 48 points in w = (s/R)^(p−1). For q = Q cos Ωt, Δ(2ζ̃ω̃) = 4c(p − 1)Q^(p−1)/(π(p + 1)Ω),
-    from which the rule is off by less than 1e-4 (p from 1.05 to 2.95), and Δ(ω̃²) ≈ −cQ^(p−1).
+    with an error of the rule below 1e-4 (p from 1.05 to 2.95), and Δ(ω̃²) ≈ −cQ^(p−1).
 
-    `coefficient` c in (kg^1/2 m)^(1−p)/s², `exponent` p between 1 and 3 (p = 2: evenly dense).
+    `coefficient` c in (kg^1/2 m)^(1−p)/s², `exponent` p between 1 and 3 (p = 2: uniform density).
     Reference: Segalman, ASME J. Appl. Mech. 72 (2005), 752, doi:10.1115/1.1989354.
     """
 
     kind: ClassVar[str] = "iwan_microslip"
     description: ClassVar[str] = (
-        "A bolted joint whose contact slips bit by bit: the stiffness falls and the damping grows "
-        "with a power of the amplitude."
+        "A bolted joint with microslip: the stiffness decreases and the damping increases with a "
+        "power of the amplitude."
     )
     shape: ClassVar[Shape] = _SLIP
     coefficient: Scalar = parameter(
-        *("(kg^1/2 m)^(1-exponent)/s²", "stiffness that slip takes away at unit amplitude"),
+        *("(kg^1/2 m)^(1-exponent)/s²", "stiffness lost by slip at unit amplitude"),
         rules=(NOT_NEGATIVE,),
-        prior=NOT_BELOW_ZERO,
+        prior=NON_NEGATIVE,
         exponent="exponent",
     )
     exponent: Scalar = parameter(
@@ -233,7 +233,7 @@ class IwanMicroslip(AbstractSliders):
         prior=Prior(1.02, 2.98),
         typical=1.5,
     )
-    largest_slip: Scalar | None = None  # kg^1/2 m, of the sliders for integration in time
+    largest_slip: Scalar | None = None  # kg^1/2 m, of the sliders for time integration
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
@@ -246,19 +246,19 @@ class IwanMicroslip(AbstractSliders):
     def with_thresholds(self, largest: Scalar) -> Self:
         """The element with sliders up to the slip displacement `largest` (kg^1/2 m).
 
-        They hold for motions with |q| up to `largest`: beyond it, slip is missing.
+        Valid for motions with |q| up to `largest`: slip beyond it is missing.
         """
         return dataclasses.replace(self, largest_slip=jnp.asarray(largest, dtype=jnp.float64))
 
     def added_stiffness(self) -> Scalar:
-        """Nothing: its sliders never all stick, and what slip takes away is all that is stated."""
+        """Zero: the force is only the loss by slip, as the total stuck stiffness is unbounded."""
         return jnp.zeros(())
 
     def sliders(self) -> Sliders:
         """Raises `ValueError` before `with_thresholds`."""
         if self.largest_slip is None:
             raise ValueError(
-                "iwan_microslip has no states yet: `scaled_for` or `with_thresholds` must set the "
+                "iwan_microslip has no states yet: `scaled_for` or `with_thresholds` must set its "
                 "largest displacement first."
             )
         return self._sliders_up_to(self.largest_slip)
@@ -280,50 +280,50 @@ class IwanMicroslip(AbstractSliders):
         """Masing's rule between two turning points."""
         high, low, falling = _turning_points(displacement)
         half_range = 0.5 * (high - low)
-        gone = jnp.where(falling, high - displacement, displacement - low) / 2
-        branch = self._lost(half_range) - 2 * self._lost(gone)
-        # All sliders that slip are centred on the middle of the cycle.
+        excursion = jnp.where(falling, high - displacement, displacement - low) / 2
+        branch = self._lost(half_range) - 2 * self._lost(excursion)
+        # All slipping sliders are centred on the mean of the cycle.
         safe = jnp.where(half_range > 0, half_range, 1.0)
         mean = self.exponent * self._lost(half_range) / safe * 0.5 * (high + low)
         return jnp.where(falling, -branch, branch) - mean
 
     def _lost(self, stretch: Array) -> Array:
-        """The force c x^p that slip has taken from the backbone."""
+        """The force c x^p lost by slip on the backbone."""
         safe = jnp.where(stretch > 0, stretch, 1.0)
         return jnp.where(stretch > 0, self.coefficient * safe**self.exponent, 0.0)
 
 
 def _turning_points(q: Float[Array, " time"]) -> tuple[Array, Array, Array]:
-    """The largest and the smallest sample, NaN where there are further turns, and what falls."""
+    """Largest and smallest sample, NaN with more than two turning points, and falling samples."""
     n = q.shape[0]
     top, bottom = jnp.argmax(q), jnp.argmin(q)
     since, fall = (jnp.arange(n) - top) % n, (bottom - top) % n
     ahead = jnp.roll(q, -1) - q
     only_two = jnp.all(jnp.where(since < fall, ahead <= 0, ahead >= 0))
-    nothing = jnp.where(only_two, 0.0, jnp.nan)
-    return q[top] + nothing, q[bottom] + nothing, since <= fall
+    valid = jnp.where(only_two, 0.0, jnp.nan)
+    return q[top] + valid, q[bottom] + valid, since <= fall
 
 
 class CoulombFriction(AbstractHysteresis):
     """f = F_c sgn q̇ (dry friction); 2ζ̃ω̃ rises by 4F_c/(πΩQ).
 
-    `force` F_c in kg^1/2 m/s². No memory, but a jump, which is smoothed with the cycle's own
+    `force` F_c in kg^1/2 m/s². No internal variables, but a jump, smoothed with the cycle's rms
     velocity: F_c tanh(q̇/(s q̇_rms)) with s = `smoothing`, 0.05. Its first harmonic is then 5.1e-4
-    below F_c·4/π for a sinusoidal motion, and a motion at rest meets no force. In time it is
-    F_c tanh(q̇/v_s) with v_s = `smoothing_velocity` in kg^1/2 m/s, or sgn q̇ where v_s = 0.
+    below F_c·4/π for a sinusoidal motion, and the force at rest is zero. In time integration it is
+    F_c tanh(q̇/v_s) with v_s = `smoothing_velocity` in kg^1/2 m/s, or sgn q̇ if v_s = 0.
     """
 
     kind: ClassVar[str] = "coulomb_friction"
     description: ClassVar[str] = (
-        "Dry friction: a force of constant size against the direction of motion, which matters "
-        "most at small amplitudes."
+        "Dry friction: a force of constant magnitude against the velocity, most important at "
+        "small amplitudes."
     )
     shape: ClassVar[Shape] = Shape(
         *(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY), power=-1, factor=4 / np.pi
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (FRICTION_OR_FORCE_OFFSET,)
     force: Scalar = parameter(
-        "kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,), prior=NOT_BELOW_ZERO
+        "kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,), prior=NON_NEGATIVE
     )
     smoothing_velocity: Scalar = eqx.field(default_factory=lambda: jax.device_put(np.zeros(())))
     smoothing: Scalar = eqx.field(default_factory=lambda: jax.device_put(np.asarray(SMOOTHING)))

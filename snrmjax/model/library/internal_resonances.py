@@ -1,4 +1,4 @@
-"""Internal resonances: a further mode that the mode of interest drives through the potential."""
+"""Internal resonances: an added mode driven by the mode of interest through the potential."""
 
 import dataclasses
 from typing import ClassVar, Self
@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from snrmjax.model.effect_base import AbstractAddedMode, Bounds, Scalar, Starts
 from snrmjax.model.effect_metadata import (
-    FURTHER_DAMPING,
+    ADDED_MODE_DAMPING,
     Confounder,
     MotionScales,
     Part,
@@ -24,42 +24,42 @@ from snrmjax.model.potential import Monomial, PolynomialPotential
 from snrmjax.numerics.rules import OF_A_DAMPING_RATIO, OF_A_FREQUENCY
 from snrmjax.numerics.units import HERTZ
 
-_NEAR = (0.8, 1.2)  # over the multiple of the natural frequency: where a further mode may lie
+_NEAR = (0.8, 1.2)  # bounds of the added mode's frequency over the multiple of ω₀
 
 
 class AbstractInternalResonance(AbstractAddedMode):
-    """V gains b q_jⁿ q_new, with a mode that no sensor sees and that no force drives directly.
+    """V += b q_jⁿ q_new, with a mode of zero participation and zero shape at the sensors.
 
     `coefficient` b in (kg^1/2 m)^(1−n)/s²; `frequency_hz` and `damping_ratio` are those of the
-    new mode, which is excited strongly where it lies near n times the mode of interest.
+    new mode, which resonates if it lies near n times the mode of interest.
     """
 
-    order: ClassVar[int]  # n: cycles of the further mode to one of the mode of interest
+    order: ClassVar[int]  # n: cycles of the added mode per cycle of the mode of interest
     confounders: ClassVar[tuple[Confounder, ...]] = (WHICH_RESONANCE,)
     coefficient: Scalar
     frequency_hz: Scalar = parameter(
-        "Hz", "natural frequency of the further mode", rules=OF_A_FREQUENCY
+        "Hz", "natural frequency of the added mode", rules=OF_A_FREQUENCY
     )
     damping_ratio: Scalar = parameter(
-        *("1", "damping ratio of the further mode"),
+        *("1", "damping ratio of the added mode"),
         rules=OF_A_DAMPING_RATIO,
-        prior=FURTHER_DAMPING,
+        prior=ADDED_MODE_DAMPING,
     )
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """Further modes at and near n times the frequency.
+        """Added modes at and near n times the frequency.
 
-        At resonance q_new ~ bQⁿ/(2ⁿ⁻¹·2ζω²), which acts back like n b Qⁿ⁻² q_new."""
+        At resonance q_new ~ bQⁿ/(2ⁿ⁻¹·2ζω²), with the reaction n b Qⁿ⁻² q_new on Q."""
         n, hz = cls.order, scales.frequency / HERTZ
-        size = np.sqrt(scales.change * 0.02 * (n * scales.frequency) ** 2)
-        size = float(size / scales.amplitude ** (n - 1))
+        coupling = np.sqrt(scales.change * 0.02 * (n * scales.frequency) ** 2)
+        coupling = float(coupling / scales.amplitude ** (n - 1))
         fractions = (0.95, 0.985, 1.0, 1.015, 1.05)
-        return [(size, n * hz * fraction, scales.damping_ratio) for fraction in fractions]
+        return [(coupling, n * hz * fraction, scales.damping_ratio) for fraction in fractions]
 
     @classmethod
     def bounds(cls, scales: MotionScales) -> Bounds:
-        """The further mode lies near n times the frequency."""
+        """The added mode lies near n times the frequency."""
         hz = cls.order * scales.frequency / HERTZ
         free, _, damped = super().bounds(scales)
         return [free, (_NEAR[0] * hz, _NEAR[1] * hz), damped]
@@ -71,7 +71,7 @@ class AbstractInternalResonance(AbstractAddedMode):
 
     @classmethod
     def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
-        """The further mode a tenth above n times ω₀."""
+        """The added mode a tenth above n times ω₀."""
         hz = 1.1 * cls.order * natural_frequency / HERTZ
         return cls(*jax.device_put([np.asarray(value) for value in (0.0, hz, damping_ratio)]))
 
@@ -79,12 +79,12 @@ class AbstractInternalResonance(AbstractAddedMode):
         self, modes: LinearModes, potential: PolynomialPotential
     ) -> tuple[LinearModes, PolynomialPotential]:
         n_modes, frequency = modes.n_modes, HERTZ * jnp.asarray(self.frequency_hz)
-        unseen = jnp.zeros((modes.mode_shape.shape[0], 1))
+        no_shape = jnp.zeros((modes.mode_shape.shape[0], 1))
         expanded_modes = dataclasses.replace(
             modes,
             natural_frequency=jnp.append(modes.natural_frequency, frequency),
             damping_ratio=jnp.append(modes.damping_ratio, self.damping_ratio),
-            mode_shape=jnp.concatenate([modes.mode_shape, unseen], axis=1),
+            mode_shape=jnp.concatenate([modes.mode_shape, no_shape], axis=1),
             participation=jnp.append(modes.participation, 0.0),
             natural_frequency_std=jnp.append(modes.natural_frequency_std, 0.0),
             damping_ratio_std=jnp.append(modes.damping_ratio_std, 0.0),
@@ -98,7 +98,7 @@ class AbstractInternalResonance(AbstractAddedMode):
 
 
 class InternalResonanceOneToThree(AbstractInternalResonance):
-    """V gains b q_j³ q_new: a third harmonic that resonates with a further mode."""
+    """V += b q_j³ q_new: the third harmonic resonates with an additional mode."""
 
     kind: ClassVar[str] = "internal_resonance_1_3"
     description: ClassVar[str] = (
@@ -111,7 +111,7 @@ class InternalResonanceOneToThree(AbstractInternalResonance):
 
 
 class InternalResonanceOneToTwo(AbstractInternalResonance):
-    """V gains b q_j² q_new: a second harmonic that resonates with a further mode."""
+    """V += b q_j² q_new: the second harmonic resonates with an additional mode."""
 
     kind: ClassVar[str] = "internal_resonance_1_2"
     description: ClassVar[str] = (
@@ -124,7 +124,7 @@ class InternalResonanceOneToTwo(AbstractInternalResonance):
 
 
 def _padded(values: Array | None, axes: int = 1) -> Array | None:
-    """Numbers of modes with a zero for the further one, along the last axes."""
+    """Modal arrays padded with a zero for the added mode along the last axes."""
     if values is None:
         return None
     return jnp.pad(values, [(0, 0)] * (values.ndim - axes) + [(0, 1)] * axes)
@@ -133,7 +133,7 @@ def _padded(values: Array | None, axes: int = 1) -> Array | None:
 def _with_monomial(
     potential: PolynomialPotential, monomial: Monomial, coefficient: Array, n_modes: int
 ) -> PolynomialPotential:
-    """The potential of more modes with one more monomial, in the order of the others."""
+    """The potential with one more monomial, in sorted order."""
     monomials = [*potential.monomials, monomial]
     rank = sorted(range(len(monomials)), key=lambda k: (len(monomials[k]), monomials[k]))
     values = jnp.append(potential.coefficient, coefficient)

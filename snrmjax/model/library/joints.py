@@ -1,4 +1,4 @@
-"""Elements of joints and linkages, for points of a structure: their parameters are in N and m."""
+"""Elements of joints and linkages between points, with parameters in N and m."""
 
 import dataclasses
 from typing import ClassVar, Self
@@ -12,10 +12,10 @@ from snrmjax.numerics.rules import ABOVE_MINUS_ONE, NOT_NEGATIVE, POSITIVE
 
 
 class RegularisedFriction(AbstractMemoryless):
-    """f = F tanh(ẋ/v): dry friction that creeps below the velocity v.
+    """f = F tanh(ẋ/v): regularised dry friction, which creeps below the velocity v.
 
-    `force` F and `velocity` v, which is a property of the model, not of the motion: below it the
-    friction is a damper F/v. Coulomb's law proper is `coulomb_friction`.
+    `force_limit` F and `velocity` v, a property of the model, not of the motion: below it the
+    friction is a damper F/v. Coulomb's law itself is `coulomb_friction`.
     """
 
     kind: ClassVar[str] = "regularised_friction"
@@ -29,14 +29,16 @@ class RegularisedFriction(AbstractMemoryless):
 
 
 class SpringLinkage(AbstractMemoryless):
-    """f = k x (1 − l₀/√(l² + x²)): a spring across the motion, as a pivoted link has it.
+    """f = k x (1 − l₀/√(l² + x²)): a pivoted spring perpendicular to the motion.
 
-    `stiffness` k, `length` l between its ends at x = 0, `free_length` l₀ of the spring without
-    load: above l it is compressed there and pushes outwards, below it pulls back.
+    `stiffness` k, `length` l between its ends at x = 0, `free_length` l₀ of the unloaded spring:
+    with l₀ > l it is compressed at x = 0 and drives the motion away from there, otherwise back.
     """
 
     kind: ClassVar[str] = "spring_linkage"
-    description: ClassVar[str] = "A linear spring that stands across the motion and turns with it."
+    description: ClassVar[str] = (
+        "A linear spring perpendicular to the motion at rest, which rotates with it."
+    )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.ODD, Argument.DISPLACEMENT)
     stiffness: Scalar = parameter("1/s²", "stiffness of the spring", rules=(NOT_NEGATIVE,))
     length: Scalar = parameter("kg^1/2 m", "distance of its ends at rest", rules=(POSITIVE,))
@@ -48,9 +50,9 @@ class SpringLinkage(AbstractMemoryless):
 
 
 class StaticLoad(AbstractMemoryless):
-    """A constant force F on the structure along +x, as a weight has it: f = −F; `load` is F.
+    """A constant force F on the structure along +x, such as a weight: f = −F; `load` is F.
 
-    The same force as `static_preload` of the same number.
+    Equal to `static_preload` of the same value at points.
     """
 
     kind: ClassVar[str] = "static_load"
@@ -65,25 +67,23 @@ class StaticLoad(AbstractMemoryless):
 
 
 class FourParameterIwan(AbstractSliders):
-    """Segalman's joint: sliders of density R φ^χ up to φ_max, and some that slip at φ_max together.
+    """Segalman's joint: sliders of density R φ^χ up to φ_max, and a Dirac density at φ_max.
 
-    `slip_force` F_s with which the whole joint slips, `stiffness` K_t while all of it sticks,
-    `exponent` χ (from above −1 to 0: the loss per cycle grows with the power χ + 3 of the
-    amplitude) and `ratio` β of the sliders at φ_max to the others in stiffness. Sliders up to the
-    largest displacement of a motion are resolved by Gauss's rule with 48 points, in the power of
-    φ in which they are evenly dense; the others stick.
+    `slip_force` F_s of macroslip, stuck `stiffness` K_t, `exponent` χ (from above −1 to 0: the
+    loss per cycle grows with the power χ + 3 of the amplitude) and `ratio` β of the stiffness of
+    the sliders at φ_max to that of the others. Sliders up to the largest displacement of a motion
+    are integrated by Gauss's rule with 48 points, in the power of φ with uniform density; the
+    others stick.
     Reference: Segalman, ASME J. Appl. Mech. 72 (2005), 752, doi:10.1115/1.1989354.
     """
 
     kind: ClassVar[str] = "four_parameter_iwan"
-    description: ClassVar[str] = (
-        "A bolted joint that slips bit by bit and at a limiting force as a whole."
-    )
+    description: ClassVar[str] = "A bolted joint with microslip, and macroslip at a limiting force."
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
     slip_force: Scalar = parameter("kg^1/2 m/s²", "force of macroslip", rules=(POSITIVE,))
     stiffness: Scalar = parameter("1/s²", "stiffness while it sticks", rules=(POSITIVE,))
     exponent: Scalar = parameter("1", "power of the density", rules=(ABOVE_MINUS_ONE,))
-    ratio: Scalar = parameter("1", "stiffness at the end over the rest", rules=(NOT_NEGATIVE,))
+    ratio: Scalar = parameter("1", "stiffness at φ_max over the rest", rules=(NOT_NEGATIVE,))
     largest_slip: Scalar | None = None  # of the sliders that are resolved, in m
 
     @property
@@ -101,13 +101,14 @@ class FourParameterIwan(AbstractSliders):
         largest = end if self.largest_slip is None else jnp.minimum(self.largest_slip, end)
         spread = self.stiffness / (1 + self.ratio)  # of all below φ_max
         fraction = jnp.where(largest > 0, largest, 0.0) / end
-        some = jnp.where(fraction > 0, fraction, 1.0) ** power * jnp.where(
+        slipping = jnp.where(fraction > 0, fraction, 1.0) ** power * jnp.where(
             fraction > 0, spread, 0.0
         )
         slip = largest * jnp.asarray(NODE) ** (1 / power)
-        rest = jnp.stack([self.stiffness - spread, spread - some])
+        rest = jnp.stack([self.stiffness - spread, spread - slipping])
         return Sliders(
-            jnp.concatenate([some * WEIGHT, rest]), jnp.concatenate([slip, jnp.stack([end, end])])
+            jnp.concatenate([slipping * WEIGHT, rest]),
+            jnp.concatenate([slip, jnp.stack([end, end])]),
         )
 
     def for_cycle(self, displacement: Samples) -> Self:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from snrmjax.model.effect_base import AbstractLinearChange, Scalar
 from snrmjax.model.effect_metadata import (
-    MORE_THAN_NOTHING,
+    POSITIVE_FACTOR,
     Confounder,
     Part,
     Shape,
@@ -19,7 +19,7 @@ from snrmjax.numerics.rules import ABOVE_MINUS_ONE
 def _shifted(
     natural_frequency: Scalar, damping_ratio: Scalar, relative_shift: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """What ω₀ → ω₀(1 + s) with the same ζ adds to mass, damping and stiffness."""
+    """Additions to mass, damping and stiffness for ω₀ → ω₀(1 + s) at constant ζ."""
     damping = 2 * damping_ratio * natural_frequency * relative_shift
     stiffness = natural_frequency**2 * relative_shift * (2 + relative_shift)
     return jnp.zeros(()), damping, stiffness
@@ -30,7 +30,7 @@ class LinearFrequencyShift(AbstractLinearChange):
 
     kind: ClassVar[str] = "linear_frequency_shift"
     description: ClassVar[str] = (
-        "The natural frequency differs from the one stated: the linear stiffness is not that of "
+        "The natural frequency differs from the model's: the linear stiffness is not that of "
         "the linear test."
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
@@ -39,7 +39,7 @@ class LinearFrequencyShift(AbstractLinearChange):
         "1",
         "relative shift of the natural frequency",
         rules=(ABOVE_MINUS_ONE,),
-        prior=MORE_THAN_NOTHING,
+        prior=POSITIVE_FACTOR,
         start=lambda scales: 0.5 * scales.change / scales.frequency**2,
     )
 
@@ -57,8 +57,7 @@ class FrequencyDrift(AbstractLinearChange):
 
     kind: ClassVar[str] = "frequency_drift"
     description: ClassVar[str] = (
-        "The natural frequency drifts in the course of the test, with temperature or as a joint "
-        "settles."
+        "The natural frequency drifts during the test, with temperature or as a joint settles."
     )
     shape: ClassVar[Shape] = Shape(Part.TIME)
     confounders: ClassVar[tuple[Confounder, ...]] = (DRIFT,)
@@ -66,7 +65,7 @@ class FrequencyDrift(AbstractLinearChange):
         "1",
         "relative shift of the natural frequency over the test",
         rules=(ABOVE_MINUS_ONE,),
-        prior=MORE_THAN_NOTHING,
+        prior=POSITIVE_FACTOR,
         start=lambda scales: scales.change / scales.frequency**2,
     )
 
@@ -80,7 +79,7 @@ class LinearDampingChange(AbstractLinearChange):
     """ζ → ζ + Δ: 2ζω₀ rises by 2Δω₀; `damping_ratio_change` is Δ, a fraction of critical."""
 
     kind: ClassVar[str] = "linear_damping_change"
-    description: ClassVar[str] = "The linear damping differs from the one stated."
+    description: ClassVar[str] = "The linear damping differs from the model's."
     shape: ClassVar[Shape] = Shape(Part.DAMPING, power=0)
     damping_ratio_change: Scalar = parameter(
         *("1", "change of the damping ratio"),
@@ -98,7 +97,7 @@ class AddedMass(AbstractLinearChange):
 
     kind: ClassVar[str] = "added_mass"
     description: ClassVar[str] = (
-        "A mass that the model lacks, such as that of a sensor or of a shaker's armature."
+        "A mass missing in the model, such as that of a sensor or of a shaker's armature."
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
     confounders: ClassVar[tuple[Confounder, ...]] = (STIFFNESS_OR_MASS,)
@@ -106,7 +105,7 @@ class AddedMass(AbstractLinearChange):
     mass: Scalar = parameter(
         *("1", "mass over the modal mass"),
         rules=(ABOVE_MINUS_ONE,),
-        prior=MORE_THAN_NOTHING,
+        prior=POSITIVE_FACTOR,
         start=lambda scales: scales.change / scales.frequency**2,
     )
 

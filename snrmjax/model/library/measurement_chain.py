@@ -1,4 +1,4 @@
-"""Errors of force and instruments, and responses of modes that the model lacks."""
+"""Errors of the excitation and the instruments, and modes missing in the model."""
 
 from typing import Any, ClassVar, Self
 
@@ -14,8 +14,8 @@ from snrmjax.model.effect_base import (
     Starts,
 )
 from snrmjax.model.effect_metadata import (
-    FURTHER_DAMPING,
-    MORE_THAN_NOTHING,
+    ADDED_MODE_DAMPING,
+    POSITIVE_FACTOR,
     VISIBLE_CHANGE,
     Confounder,
     MotionScales,
@@ -29,18 +29,18 @@ from snrmjax.model.library.confounders import (
     FORCE_OR_SENSOR_GAIN,
     FRICTION_OR_FORCE_OFFSET,
     FURTHER_MODE,
-    SIZE_OF_RESPONSE,
+    RESPONSE_SCALE,
     STRUCTURE_OR_FORCE_SPECTRUM,
 )
 from snrmjax.numerics.rules import ABOVE_MINUS_ONE, OF_A_DAMPING_RATIO, OF_A_FREQUENCY
 from snrmjax.numerics.units import DEGREE, HERTZ
 
-_SIZE = "size of the response"
-_LIGHT = 1e-3  # damping ratio of a close mode, where the model itself has none
-_WIDE = 0.15  # relative distance in frequency, beyond which a mode is a far one
-_RELATIVE: dict[str, Any] = {  # what a relative error may be, and from what it begins
+_SCALE = "scale of the response"
+_LIGHT = 1e-3  # damping ratio of a close mode if that of the model is zero
+_WIDE = 0.15  # relative distance in frequency, beyond which a mode counts as a residual one
+_RELATIVE: dict[str, Any] = {  # bounds and starting value of a relative error
     "rules": (ABOVE_MINUS_ONE,),
-    "prior": MORE_THAN_NOTHING,
+    "prior": POSITIVE_FACTOR,
     "start": lambda _: VISIBLE_CHANGE,
 }
 Amplitude = Float[Array, " state"]
@@ -52,7 +52,7 @@ class ForceHarmonics(AbstractForceSpectrum):
 
     kind: ClassVar[str] = "force_harmonics"
     description: ClassVar[str] = (
-        "The force of the shaker is not a pure sine: it has harmonics 2 and 3 of its own."
+        "The force of the shaker is not a pure sine: it contains harmonics 2 and 3."
     )
     shape: ClassVar[Shape] = Shape(Part.HARMONICS)
     confounders: ClassVar[tuple[Confounder, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
@@ -75,7 +75,7 @@ class ForceGainError(AbstractMeasurementEffect):
         "The force is recorded in a wrong scale: the calibration factor of the force sensor, or a "
         "mass between it and the structure."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
+    confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE, FORCE_OR_SENSOR_GAIN)
     like_force_gain: ClassVar[bool] = True
     gain: Scalar = parameter(*("1", "relative error of the force"), **_RELATIVE)
 
@@ -90,12 +90,12 @@ class ForceOffsetError(AbstractMeasurementEffect):
 
     kind: ClassVar[str] = "force_offset_error"
     description: ClassVar[str] = (
-        "The recorded amplitude of the force is too small or too large by a constant, as a noise "
-        "floor or a threshold makes it."
+        "The recorded amplitude of the force is too small or too large by a constant, such as a "
+        "noise floor or a threshold."
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (FRICTION_OR_FORCE_OFFSET,)
     offset: Scalar = parameter(
-        *("N", "true less recorded amplitude of the force"),
+        *("N", "true minus recorded amplitude of the force"),
         start=lambda scales: VISIBLE_CHANGE * scales.smallest_force,
     )
 
@@ -106,14 +106,14 @@ class ForceOffsetError(AbstractMeasurementEffect):
 
 
 class SensorGainError(AbstractMeasurementEffect):
-    """The recorded velocity, every harmonic of it, is the true one times 1 + s; `gain` is s."""
+    """Every harmonic of the recorded velocity is the true one times 1 + s; `gain` is s."""
 
     kind: ClassVar[str] = "sensor_gain_error"
     description: ClassVar[str] = (
         "The velocity is recorded in a wrong scale: the calibration factor of the sensor, or peak "
         "values taken for amplitudes."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
+    confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE, FORCE_OR_SENSOR_GAIN)
     like_force_gain: ClassVar[bool] = True
     gain: Scalar = parameter(*("1", "relative error of the velocity"), **_RELATIVE)
 
@@ -126,13 +126,13 @@ class SensorGainError(AbstractMeasurementEffect):
 class SensorPhaseError(AbstractMeasurementEffect):
     """The recorded velocity leads the true one by φ; `phase_deg` is φ in degrees.
 
-    As a shift in time would have it: harmonic h leads by hφ, and the mean is untouched.
+    As with a time shift, harmonic h leads by hφ, and the mean is unchanged.
     """
 
     kind: ClassVar[str] = "sensor_phase_error"
     description: ClassVar[str] = (
-        "The recorded velocity leads or lags by a constant phase, as a filter or a delay between "
-        "the channels makes it."
+        "The recorded velocity leads or lags by a constant phase, such as that of a filter or a "
+        "delay between the channels."
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
     only_phase: ClassVar[bool] = True
@@ -149,32 +149,32 @@ class SensorPhaseError(AbstractMeasurementEffect):
 
 
 class ResidualMode(AbstractMeasurementEffect):
-    """X_recorded = X + R F: far modes move every sensor with the force; `receptance` is R in m/N.
+    """X_recorded = X + R F: residual of distant modes at every sensor; `receptance` is R in m/N.
 
     The velocity's fundamental gains iΩRF.
     """
 
     kind: ClassVar[str] = "residual_mode"
     description: ClassVar[str] = (
-        "Modes far from the measured frequencies, which the model lacks, add a displacement that "
-        "is proportional to the force."
+        "Modes far from the measured frequencies, missing in the model, add a displacement "
+        "proportional to the force."
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
     follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
     receptance: Scalar = parameter(
-        *("m/N", "displacement of the far modes over the force"),
+        *("m/N", "displacement of the distant modes over the force"),
         start=lambda scales: VISIBLE_CHANGE * scales.receptance,
     )
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
-        return force, _moved_by(velocity, 1j * frequency * self.receptance * force)
+        return force, _with_fundamental(velocity, 1j * frequency * self.receptance * force)
 
 
 class CloseMode(AbstractMeasurementEffect):
-    """X_recorded = X + A F/(ω² − Ω² + 2iζωΩ): a linear mode close by, which all sensors see alike.
+    """X_recorded = X + A F/(ω² − Ω² + 2iζωΩ): a close linear mode, equal at all sensors.
 
     `modal_constant` is A in 1/kg, the product of the mode's shapes at sensor and force;
     `frequency_hz` and `damping_ratio` are the mode's own. The velocity's fundamental gains the
@@ -184,7 +184,7 @@ class CloseMode(AbstractMeasurementEffect):
 
     kind: ClassVar[str] = "close_mode"
     description: ClassVar[str] = (
-        "A further linear mode near the measured frequencies, which the model lacks, adds its own "
+        "A further linear mode near the measured frequencies, missing in the model, adds its "
         "response."
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (FURTHER_MODE,)
@@ -198,12 +198,12 @@ class CloseMode(AbstractMeasurementEffect):
         prior=Prior(1 - 2 * _WIDE, 1 + 2 * _WIDE, lambda scales: scales.frequency / HERTZ),
     )
     damping_ratio: Scalar = parameter(
-        *("1", "its damping ratio"), rules=OF_A_DAMPING_RATIO, prior=FURTHER_DAMPING
+        *("1", "its damping ratio"), rules=OF_A_DAMPING_RATIO, prior=ADDED_MODE_DAMPING
     )
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """Modes some half-power bandwidths away, as strong as a visible change at resonance."""
+        """Modes a few half-power bandwidths away, of a clearly visible amplitude at resonance."""
         starts: Starts = []
         ratio = max(scales.damping_ratio, _LIGHT)
         for away in (-8.0, -3.0, 3.0, 8.0):
@@ -215,7 +215,7 @@ class CloseMode(AbstractMeasurementEffect):
 
     @classmethod
     def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
-        """A half bandwidth in frequency."""
+        """Half a half-power bandwidth in frequency."""
         constant, hz, ratio = start
         return abs(constant), ratio * hz, 0.5 * ratio
 
@@ -229,7 +229,9 @@ class CloseMode(AbstractMeasurementEffect):
     ) -> tuple[Amplitude, Velocity]:
         natural = HERTZ * self.frequency_hz
         stiffness = natural**2 - frequency**2 + 2j * self.damping_ratio * natural * frequency
-        return force, _moved_by(velocity, 1j * frequency * self.modal_constant * force / stiffness)
+        return force, _with_fundamental(
+            velocity, 1j * frequency * self.modal_constant * force / stiffness
+        )
 
 
 class ModeShapeChange(AbstractMeasurementEffect):
@@ -237,10 +239,10 @@ class ModeShapeChange(AbstractMeasurementEffect):
 
     kind: ClassVar[str] = "mode_shape_change"
     description: ClassVar[str] = (
-        "The mode shape changes with the amplitude: the sensor's share of the motion is not "
-        "constant."
+        "The mode shape changes with the amplitude: the ratio of sensor motion to modal "
+        "coordinate is not constant."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (SIZE_OF_RESPONSE,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE,)
     stage: ClassVar[int] = 0
     coefficient: Scalar = parameter(
         *("1/(kg m²)", "relative change per squared amplitude"),
@@ -253,7 +255,7 @@ class ModeShapeChange(AbstractMeasurementEffect):
         return force, velocity * (1 + self.coefficient * displacement**2)[..., None, None]
 
 
-def _moved_by(velocity: Velocity, added: Complex[Array, " state"]) -> Velocity:
-    """Velocities whose fundamental has gained something, at every sensor."""
+def _with_fundamental(velocity: Velocity, added: Complex[Array, " state"]) -> Velocity:
+    """The velocities with `added` on the fundamental, at every sensor."""
     fundamental = np.eye(velocity.shape[-2])[1][:, None]
     return velocity + added[..., None, None] * fundamental

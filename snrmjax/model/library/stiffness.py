@@ -1,4 +1,4 @@
-"""Elastic restoring forces: smooth stiffness laws, contacts with a kink, and a preload."""
+"""Elastic restoring forces: smooth stiffness, piecewise linear contacts, and a preload."""
 
 from typing import ClassVar
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.model.effect_base import AbstractMemoryless, AbstractNonsmooth, Scalar, Starts
 from snrmjax.model.effect_metadata import (
-    NOT_BELOW_ZERO,
+    NON_NEGATIVE,
     Argument,
     Confounder,
     MotionScales,
@@ -19,8 +19,8 @@ from snrmjax.model.effect_metadata import (
 )
 from snrmjax.model.library.confounders import (
     ONE_SIDED_OR_TWO_SIDED,
+    SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,
     STRUCTURE_OR_FORCE_SPECTRUM,
-    TOLD_BY_MEAN_OR_SECOND_HARMONIC,
 )
 from snrmjax.model.nonsmooth_points import NonsmoothPoints
 from snrmjax.numerics.rules import NOT_NEGATIVE
@@ -28,7 +28,7 @@ from snrmjax.numerics.rules import NOT_NEGATIVE
 _ODD = Shape(Part.STIFFNESS, Symmetry.ODD, Argument.DISPLACEMENT)
 _EVEN = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT, strength_order=2)
 _OF_A_GAP = Prior(0.0, 1.2, lambda scales: scales.largest)
-_FRACTIONS = (0.3, 0.55, 0.75, 0.9)  # of the largest amplitude: gaps from which a fit begins
+_FRACTIONS = (0.3, 0.55, 0.75, 0.9)  # of the largest amplitude: starting values of a gap
 
 
 def _contact_starts(scales: MotionScales, fraction: float) -> Starts:
@@ -40,11 +40,11 @@ class CubicStiffness(AbstractMemoryless):
 
     kind: ClassVar[str] = "cubic_stiffness"
     description: ClassVar[str] = (
-        "A spring that stiffens (below zero: softens) with the square of the amplitude, as the "
-        "stretching of a clamped beam makes it."
+        "A spring that stiffens (below zero: softens) with the square of the amplitude, as by "
+        "midplane stretching of a clamped beam."
     )
     shape: ClassVar[Shape] = _ODD._replace(power=2, factor=0.75)
-    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg m² s²)", "cubic stiffness")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -54,24 +54,24 @@ class CubicStiffness(AbstractMemoryless):
 class QuadraticStiffness(AbstractMemoryless):
     """f = a q²; `coefficient` is a in 1/(kg^1/2 m s²).
 
-    To first order it makes a mean displacement and a second harmonic; through these it softens:
-    Δ(ω̃²) = −(5/6) a²Q²/ω₀².
+    To first order it generates a mean displacement and a second harmonic; through these it
+    softens: Δ(ω̃²) = −(5/6) a²Q²/ω₀².
     """
 
     kind: ClassVar[str] = "quadratic_stiffness"
     description: ClassVar[str] = (
-        "A spring that is stiffer on one side than on the other, as curvature or a static load "
-        "makes it: the motion loses its symmetry and softens."
+        "A spring that is stiffer on one side than on the other, as by curvature or a static "
+        "load: the motion loses its symmetry and softens."
     )
     shape: ClassVar[Shape] = _EVEN._replace(power=2)
-    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg^1/2 m s²)", "quadratic stiffness")
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """Softening by the visible change, with either sign."""
-        size = float(np.sqrt(1.2 * scales.change) * scales.frequency / scales.amplitude)
-        return [(size,), (-size,)]
+        """Softening by a clearly visible change, with either sign."""
+        coefficient = float(np.sqrt(1.2 * scales.change) * scales.frequency / scales.amplitude)
+        return [(coefficient,), (-coefficient,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         return self.coefficient * displacement**2
@@ -101,8 +101,8 @@ class BilinearStiffness(AbstractNonsmooth):
     kind: ClassVar[str] = "bilinear_stiffness"
     is_straight: ClassVar[bool] = True
     description: ClassVar[str] = (
-        "A spring with one stiffness for each direction, as a crack or a contact that opens and "
-        "closes makes it."
+        "A spring with one stiffness for each direction, as of a breathing crack or a contact "
+        "that opens and closes."
     )
     shape: ClassVar[Shape] = _EVEN
     confounders: ClassVar[tuple[Confounder, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
@@ -124,7 +124,7 @@ class BilinearStiffness(AbstractNonsmooth):
 class GapStiffness(AbstractNonsmooth):
     """A spring that engages beyond ±`gap` (kg^1/2 m); its `stiffness` is in 1/s².
 
-    It shows above an amplitude of `gap` only, in odd harmonics.
+    It acts only above an amplitude of `gap`, and generates odd harmonics.
     """
 
     kind: ClassVar[str] = "gap_stiffness"
@@ -135,14 +135,14 @@ class GapStiffness(AbstractNonsmooth):
     )
     shape: ClassVar[Shape] = _ODD
     confounders: ClassVar[tuple[Confounder, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
-    stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NOT_BELOW_ZERO)
+    stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NON_NEGATIVE)
     gap: Scalar = parameter(
         "kg^1/2 m", "displacement at contact", rules=(NOT_NEGATIVE,), prior=_OF_A_GAP
     )
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """Gaps at several shares of the largest amplitude."""
+        """Gaps at several fractions of the largest amplitude."""
         return _contact_starts(scales, 3.0)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -157,7 +157,7 @@ class GapStiffness(AbstractNonsmooth):
 class OneSidedStop(AbstractNonsmooth):
     """A spring that engages beyond +`gap` (kg^1/2 m); its `stiffness` is in 1/s².
 
-    It shows above an amplitude of `gap` only, in even and odd harmonics.
+    It acts only above an amplitude of `gap`, and generates even and odd harmonics.
     """
 
     kind: ClassVar[str] = "one_sided_stop"
@@ -167,12 +167,12 @@ class OneSidedStop(AbstractNonsmooth):
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.NEITHER, Argument.DISPLACEMENT)
     confounders: ClassVar[tuple[Confounder, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
-    stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NOT_BELOW_ZERO)
+    stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NON_NEGATIVE)
     gap: Scalar = parameter("kg^1/2 m", "displacement at contact", prior=_OF_A_GAP)
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
-        """Gaps at several shares of the largest amplitude."""
+        """Gaps at several fractions of the largest amplitude."""
         return _contact_starts(scales, 6.0)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -183,30 +183,30 @@ class OneSidedStop(AbstractNonsmooth):
 
 
 class StaticPreload(AbstractMemoryless):
-    """A constant force; with a nonlinear stiffness it shifts ω₀ and brings a second harmonic.
+    """A constant force; with a nonlinear stiffness it shifts ω₀ and generates a second harmonic.
 
-    At points it acts on the structure as `static_load` does: a positive `constant_force` F moves
-    the rest position in the positive direction, f = −F. On the mode of interest it is, as all
-    forces there are, a restoring force on the left of the equation of motion, f = F, and moves it
-    in the negative direction.
+    At points it acts on the structure like `static_load`: a positive `constant_force` F moves
+    the equilibrium in the positive direction, f = −F. On the mode of interest it is, like all
+    forces there, a restoring force on the left of the equation of motion, f = F, and moves the
+    equilibrium in the negative direction.
     """
 
     kind: ClassVar[str] = "static_preload"
     description: ClassVar[str] = (
-        "A constant force, such as weight or a clamping force, that moves the position of rest to "
-        "where a nonlinear spring is stiffer or softer; at points along the positive direction."
+        "A constant force, such as weight or a clamping force, that moves the equilibrium to where "
+        "a nonlinear spring is stiffer or softer; at points along the positive direction."
     )
     shape: ClassVar[Shape] = _EVEN
-    confounders: ClassVar[tuple[Confounder, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
-    # A linear structure does not show it; with a cubic spring it is a quadratic one.
+    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,)
+    # No effect on a linear structure; with a cubic spring it acts like a quadratic one.
     searched: ClassVar[bool] = False
     constant_force: Scalar = parameter("kg^1/2 m/s²", "constant force")
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
         """A static displacement of a fifth of the amplitude."""
-        size = 0.2 * scales.frequency**2 * scales.amplitude
-        return [(size,), (-size,)]
+        force = 0.2 * scales.frequency**2 * scales.amplitude
+        return [(force,), (-force,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         force = self.constant_force if self.at is None else -self.constant_force

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: what disagrees, before and after, and the laws of what was found."""
+"""Figures of a diagnosis: misfit before and after, and the laws of the identified effects."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.response_prediction import HeldCurve, at_curve_force
+from snrmjax.diagnose.response_prediction import ControlledVelocityCurve, at_curve_force
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import (
@@ -55,9 +55,9 @@ _LARGEST = 5.0  # misfit, in units of noise, at the end of the colour scale
 _SAMPLES = 361  # of a cycle
 _AS_IT_IS = ("Hz", "periods", "%", "%, °", "1", "√kg m/s²")  # units without prefixes
 _SINGLE_VALUED = 0.02  # of a force's range, between going there and coming back
-HELD_CAPTION = (
-    "These levels hold the response, not the force: the force that holds each level's median "
-    "velocity against frequency, without and with the effects that were found, over the measured "
+CONTROLLED_CAPTION = (
+    "These levels control the response, not the force: the force that keeps each level's median "
+    "velocity against frequency, without and with the identified effects, over the measured "
     "forces. Lines should pass through the dots; the force is smallest at resonance."
 )
 
@@ -75,21 +75,21 @@ def misfit_figure(diagnosis: Diagnosis) -> Figure:
     unit = unit_for(speed, "m/s")
     figure, ((before, after),) = panels(PAGE, 3.3, 1, 2)
     out = diagnosis.gap.interpolated
-    held = np.asarray(data.level)[rows] == out.level if out else np.zeros(len(rows), dtype=bool)
+    withheld = np.asarray(data.level)[rows] == out.level if out else np.zeros(len(rows), dtype=bool)
     for axes, title, misfit in (
         (before, "(a) model as given", misfits.before),
         (after, "(b) completed model", misfits.after),
     ):
-        size = np.sqrt(np.nanmean(misfit**2, axis=1))
-        order = np.argsort(size)  # the worst on top
-        colours: Style = {"c": size[order], "cmap": "magma_r", "vmin": 0.0, "vmax": _LARGEST}
+        rms = np.sqrt(np.nanmean(misfit**2, axis=1))
+        order = np.argsort(rms)  # the worst on top
+        colours: Style = {"c": rms[order], "cmap": "magma_r", "vmin": 0.0, "vmax": _LARGEST}
         colours |= {"s": 16, "edgecolors": "0.4", "linewidths": 0.3}
         shown = axes.scatter(frequency[order], speed[order] / unit.size, **colours)
-        if held.any():
+        if withheld.any():
             ring: Style = {"linestyle": "none", "marker": "o", "markersize": 7.0}
             ring |= {"fillstyle": "none", "color": MEASURED, "markeredgewidth": 0.8}
             name = f"level {out.level}, left out to test the answer" if out else None
-            marks(axes, frequency[held], speed[held] / unit.size, ring, name)
+            marks(axes, frequency[withheld], speed[withheld] / unit.size, ring, name)
         axes.set_ylim(bottom=0.0)
         name_axes(axes, title, "Frequency (Hz)", "")
     name_axes(before, "(a) model as given", "Frequency (Hz)", f"Velocity amplitude ({unit.name})")
@@ -103,9 +103,9 @@ def misfit_figure(diagnosis: Diagnosis) -> Figure:
 
 
 def candidates_figure(diagnosis: Diagnosis) -> Figure:
-    """What every effect would explain by itself; those of the answer in vermilion.
+    """Gain of every effect by itself, vermilion for those of the answer.
 
-    With the answer's effects those that the data cannot tell from them.
+    Also for those that the data cannot distinguish from the answer's.
 
     The bars are the gain of the Bayesian information criterion (Schwarz) over the model as given;
     left of the dashed line an effect is not detected.
@@ -132,7 +132,7 @@ def comparison_figure(
     """Simulated responses of two models over the measured steady states, side by side.
 
     States are pale where their force differs from that of every curve by more than 5 %: a test
-    that holds the response changes its force along a level, and curves of constant force meet it
+    that controls the response changes its force along a level, and curves of constant force meet it
     at resonance only. The axis ends a little above the measured velocities.
 
     Arguments: responses of the model as given and of the completed one, one a level, at the
@@ -148,15 +148,18 @@ def comparison_figure(
         [(curve.frequency / HERTZ, np.abs(np.asarray(curve.velocity)[:, 1, r])) for curve in curves]
         for curves in (before, after)
     ]
-    return _beside_one_another(lines, frequency, speed, same, ("Velocity amplitude", "m/s"))
+    return _side_by_side(lines, frequency, speed, same, ("Velocity amplitude", "m/s"))
 
 
-def held_velocity_figure(
-    before: Sequence[HeldCurve], after: Sequence[HeldCurve], data: SteadyStates, sensor: str
+def controlled_velocity_figure(
+    before: Sequence[ControlledVelocityCurve],
+    after: Sequence[ControlledVelocityCurve],
+    data: SteadyStates,
+    sensor: str,
 ) -> Figure:
-    """Force against frequency at held velocity, of two models side by side, over what was measured.
+    """Force against frequency at controlled velocity, of two models, over the measured states.
 
-    Arguments: curves of the model as given and of the completed one (`held_curves`).
+    Arguments: curves of the model as given and of the completed one (`controlled_velocity_curves`).
     """
     r = sensor_index(data.sensors, sensor)
     good = np.asarray(data.measured)[:, r]
@@ -165,10 +168,10 @@ def held_velocity_figure(
         [(curve.frequency / HERTZ, curve.force) for curve in curves] for curves in (before, after)
     ]
     every, what = np.ones(len(force), dtype=bool), ("Force amplitude", "N")
-    return _beside_one_another(lines, frequency, force, every, what, ", velocity held")
+    return _side_by_side(lines, frequency, force, every, what, ", velocity controlled")
 
 
-def _beside_one_another(
+def _side_by_side(
     lines: Sequence[Sequence[tuple[np.ndarray, np.ndarray]]],
     frequency: np.ndarray,
     measured: np.ndarray,
@@ -198,10 +201,10 @@ def _beside_one_another(
             axes.plot(x, y / unit.size, color=colour, **CURVE, label=label)
         highest = max(float(np.max(y, initial=0.0)) for _, y in curves) / unit.size  # or no point
         if highest > top:
-            place: Style = {"transform": axes.transAxes, "ha": "right", "va": "top"}
+            corner: Style = {"transform": axes.transAxes, "ha": "right", "va": "top"}
             text = f"peaks up to {highest:.2g} {unit.name}"
-            place["bbox"] = {"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1.5}
-            axes.text(0.99, 0.99, text, fontsize=SMALL, color="0.3", **place)
+            corner["bbox"] = {"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1.5}
+            axes.text(0.99, 0.99, text, fontsize=SMALL, color="0.3", **corner)
         axes.set(xlim=ends, ylim=(0.0, top))
     quantity = f"{what[0]} ({unit.name})"
     name_axes(left, f"(a) model as given{condition}", "Frequency (Hz)", quantity)
@@ -218,7 +221,7 @@ class _Curve(NamedTuple):
 
 
 class _Law(NamedTuple):
-    """What an effect does, as curves in SI units and the words of their axes."""
+    """The law of an effect as curves in SI units, with the names of their axes."""
 
     x: tuple[str, str]  # quantity and unit
     y: tuple[str, str]
@@ -229,13 +232,13 @@ class _Law(NamedTuple):
 def effect_laws_figure(
     model: Structure, data: SteadyStates, *, sensor: str | None = None
 ) -> Figure:
-    """The law of every effect of a model over the range of motion that was measured.
+    """The law of every effect of a model over the measured range of motion.
 
     Forces are drawn against displacement or velocity at the sensor, as the equivalent force in
     newtons at the drive: springs as lines against displacement, dampers as lines against velocity,
-    friction with a memory as loops for the smallest, a middle and the largest amplitude. Effects of
+    hysteretic friction as loops for the smallest, a middle and the largest amplitude. Effects of
     the instruments are drawn as the change of what they record, harmonics of the force as its
-    course over a period, and a further mode as the force that drives it.
+    course over a period, and a further mode by its coupling force.
 
     Arguments: `data` the measured steady states; `sensor` by default the first of the model.
     Raises `ValueError` where the model has no effect or not this sensor.
@@ -288,9 +291,9 @@ def _law(effect: AbstractEffect, model: Structure, data: SteadyStates, sensor: i
     if isinstance(effect, AbstractAddedMode):
         q = np.linspace(-1.0, 1.0, _SAMPLES) * motion.reached[-1].amplitude
         modes, potential = effect.expanded(model.modes, model.potential)
-        place = np.zeros((_SAMPLES, len(modes.natural_frequency)))
-        place[:, model.modes.mode_of_interest] = q
-        force = np.asarray(potential.force(jnp.asarray(place)))[:, -1]
+        displacement = np.zeros((_SAMPLES, len(modes.natural_frequency)))
+        displacement[:, model.modes.mode_of_interest] = q
+        force = np.asarray(potential.force(jnp.asarray(displacement)))[:, -1]
         quantity = ("Coupling force", "√kg m/s²")
         return _Law(("Displacement", "m"), quantity, (_Curve(motion.shape * q, force),))
     cycles = [_cycle(effect, motion, one) for one in motion.reached]
@@ -313,7 +316,7 @@ def _law(effect: AbstractEffect, model: Structure, data: SteadyStates, sensor: i
 
 
 class _Reached(NamedTuple):
-    """The farthest motion of a level."""
+    """The largest motion of a level."""
 
     amplitude: float  # kg^1/2 m, of the mode of interest
     frequency: float  # rad/s
@@ -361,7 +364,7 @@ def _cycle(effect: AbstractEffect, motion: _Motion, reached: _Reached, order: fl
         linear = jnp.asarray(motion.natural_frequency), jnp.asarray(motion.damping_ratio)
         mass, damping, stiffness = map(float, effect.linear_terms(*linear, jnp.asarray(order)))
         return q, v, (stiffness - mass * reached.frequency**2) * q + damping * v
-    raise ValueError(f"no law can be drawn of an effect of the class {type(effect).__name__}.")
+    raise ValueError(f"no law can be drawn for an effect of the class {type(effect).__name__}.")
 
 
 def _axis(effect: AbstractEffect, cycle: Cycle) -> int | None:
@@ -373,9 +376,11 @@ def _axis(effect: AbstractEffect, cycle: Cycle) -> int | None:
 
 
 def _single_valued_against(q: np.ndarray, v: np.ndarray, force: np.ndarray) -> int | None:
-    """0 where a force is a function of displacement, 1 of velocity, None where of neither."""
+    """0 for a force that is a function of displacement, 1 of velocity, None of neither."""
     allowed = _SINGLE_VALUED * max(float(np.ptp(force)), 1e-300)
-    if np.max(np.abs(force - force[::-1])) <= allowed:  # at equal displacement, going and coming
+    if (
+        np.max(np.abs(force - force[::-1])) <= allowed
+    ):  # at equal displacement, on the way there and back
         return 0
     half = (len(force) - 1) // 2
     mirrored = np.append(force[half::-1], force[-2 : half - 1 : -1])
@@ -394,7 +399,7 @@ def _force_course(effect: AbstractForceSpectrum) -> _Law:
 def _recorded_change(
     effect: AbstractMeasurementEffect, model: Structure, data: SteadyStates, sensor: int
 ) -> _Law:
-    """What an effect of the instruments changes of every recorded state."""
+    """Change of every recorded state by an effect of the instruments."""
     force, omega = np.asarray(data.force), np.asarray(data.frequency)
     speed = np.asarray(data.velocity)[:, sensor]
     good = np.isfinite(force) & np.isfinite(np.abs(speed))
@@ -409,18 +414,18 @@ def _recorded_change(
         change = 100 * (recorded_force / force - 1)
         curve = _Curve(force, change)
         return _Law(("Force", "N"), ("Change of the force", "%"), (curve,), dots=True)
-    size, turn = 100 * (np.abs(ratio) - 1), np.angle(ratio) / DEGREE
+    gain, shift = 100 * (np.abs(ratio) - 1), np.angle(ratio) / DEGREE
     speed, hertz = np.abs(speed), omega / HERTZ
-    roughness = [float(np.sum(np.abs(np.diff(size[np.argsort(x)])))) for x in (speed, hertz)]
+    roughness = [float(np.sum(np.abs(np.diff(gain[np.argsort(x)])))) for x in (speed, hertz)]
     x, quantity = speed, ("Velocity amplitude", "m/s")
     if roughness[1] < roughness[0]:
         x, quantity = hertz, ("Frequency", "Hz")
-    curves = (_Curve(x, size, "amplitude (%)"), _Curve(x, turn, "phase (°)"))
+    curves = (_Curve(x, gain, "amplitude (%)"), _Curve(x, shift, "phase (°)"))
     return _Law(quantity, ("Change of the velocity", "%, °"), curves, dots=True)
 
 
 def found_effects(diagnosis: Diagnosis) -> Structure | None:
-    """The completed model with nothing but the effects that were found; None without any."""
+    """The completed model with only the identified effects; None without any."""
     if diagnosis.completed is None or not diagnosis.effects:
         return None
     added = diagnosis.completed.effects[-len(diagnosis.effects) :]

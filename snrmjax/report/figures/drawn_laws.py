@@ -25,10 +25,10 @@ from snrmjax.report.style import (
 )
 
 LAW_CAPTION = (
-    "The force that was drawn from the data, beside the linear model, as one that acts at the "
-    "sensor's point, with its 95 % band. Crosses are the knots in model.toml; what is dashed lies "
-    "beyond the measured range and is extrapolated. Of friction it is the first loading, beside "
-    "the stuck stiffness."
+    "The force drawn from the data, in addition to the linear model, as if it acted at the "
+    "sensor, with its 95 % band. Crosses are the knots in model.toml; dashed parts lie beyond "
+    "the measured range and are extrapolated. For friction it is the initial loading curve "
+    "without the stuck stiffness."
 )
 
 

@@ -1,4 +1,4 @@
-"""Figures of an identification in the manner of the method paper: measured and identified.
+"""Figures of an identification in the style of the method paper: measured and identified.
 
 Blue is measured, vermilion identified or predicted, black simulated (broad and grey behind a
 prediction); dashed thin lines are unstable and pale ones lie beyond the measured amplitudes. Axes
@@ -82,7 +82,7 @@ class DampingSeries(NamedTuple):
 
 
 def _named_with_bars(*axes: tuple[np.ndarray, np.ndarray]) -> str:
-    """What identified points are called: of their bars only what can be seen.
+    """Legend of identified points, with their bars only where visible.
 
     Arguments: of every axis the bars and the values that it spans.
     """
@@ -109,7 +109,7 @@ def backbone_figure(
     Three panels: amplitude over velocity phase against frequency (0° at resonance), and damping
     ratio against amplitude, which is that of the velocity unless `shown` says another. Error
     bars and bands are 95 %; axes fit the points, so that a wide band may leave them. Steady states
-    that have no place in the curves, as their status says, are grey crosses.
+    that are left out of the curves, by their status, are grey crosses.
 
     Arguments: `truth` a nonlinear mode to compare with; `modes` the linear modes, of which the
     mode of interest is marked at zero amplitude.
@@ -187,7 +187,7 @@ def response_figure(
     force_tolerance: float = 0.03,
     force_unit: str = "N",
 ) -> Figure:
-    """Predicted responses, one row a force, beside harmonic balance and what was measured.
+    """Predicted responses, one row per force, with harmonic balance and measured states.
 
     Two panels a row: velocity amplitude and velocity phase against frequency. Stars are phase
     resonances, dashed parts unstable, pale ones beyond the measured amplitudes.
@@ -298,9 +298,9 @@ def force_velocity_figure(
         in_phase = ends * forces[number] / force_unit.size, ends * phasor.real / unit.size
         axes.plot(*in_phase, "--", color=SIMULATED, linewidth=0.8)
         axes.plot(force / force_unit.size, velocity / unit.size, color=MEASURED, **CURVE)
-        turn = f"{np.angle(phasor) / DEGREE:+.0f}°".replace("-", "−")
+        angle = f"{np.angle(phasor) / DEGREE:+.0f}°".replace("-", "−")
         title = f"level {int(np.asarray(data.level)[k])}, {frequency[k]:.4g} Hz\n"
-        title += f"phase {turn}, indicator {indicator[k]:.2f}"
+        title += f"phase {angle}, indicator {indicator[k]:.2f}"
         name_axes(axes, title, f"{load} ({force_unit.name})", f"Velocity ({unit.name})")
     for axes in grid.flat[len(states) :]:
         axes.remove()

@@ -1,4 +1,4 @@
-"""Figures of joint fits: curves with bands, residuals, parts of bands, where to measure next."""
+"""Figures of joint fits: curves, residuals, contributions to bands, where to measure next."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -53,11 +53,11 @@ from snrmjax.report.style import (
 from snrmjax.simulate.solutions.controlled import DampedModeBranch
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
-_LEAST_FRACTION = 0.005  # of a band's variance: what is smaller stands in one bar together
+_LEAST_FRACTION = 0.005  # of a band's variance: smaller ones are combined in one bar
 
 
 class FitSeries(NamedTuple):
-    """A joint fit to be drawn, and the points that single states give."""
+    """A joint fit to be drawn, and the points of single states."""
 
     label: str
     fit: JointFit
@@ -72,9 +72,9 @@ def fitted_curves_figure(
 ) -> Figure:
     """Natural frequency and damping of joint fits against amplitude, with 95 % bands.
 
-    The amplitude is that of the velocity unless `shown` says another. Dots are what single states
-    give on their own. Of a single fit whose levels scatter, the paler band holds the curve of one
-    further level.
+    The amplitude is that of the velocity unless `shown` says another. Dots are the results of
+    single states. For a single fit whose levels scatter, the paler band is that of a further
+    level.
 
     Arguments: `truth` a mode to compare with, of which a damped one shows its damping too.
     Returns the figure. Raises `ValueError` when there is no fit.
@@ -139,10 +139,10 @@ def residuals_figure(fit: JointFit, shown: ShownAmplitude = VELOCITY) -> Figure:
     """Misfit of each point in standard deviations, against amplitude and phase, and its spread.
 
     The amplitude is that of the velocity unless `shown` says another.
-    The part of the force balance in phase with the force, which is the damping's at resonance, and
-    the part in quadrature, which is the stiffness's there, made independent of the first. A
-    trend is what the curves do not follow; more outside ±1.96 than one in twenty is noise larger
-    than stated, or outliers.
+    The part of the force balance in phase with the force, due to damping at resonance, and the part
+    in quadrature, due to stiffness there, made independent of the first. A trend means that the
+    curves do not follow the data; more than one in twenty outside ±1.96 means noise larger than
+    stated, or outliers.
     """
     left = fit_residuals(fit)
     amplitude = shown.of(left.velocity, left.frequency)
@@ -175,9 +175,9 @@ def residuals_figure(fit: JointFit, shown: ShownAmplitude = VELOCITY) -> Figure:
 
 
 def contributions_figure(rows: Sequence[Contribution]) -> Figure:
-    """What the bands of both curves are made of: shares of their variance, as bars.
+    """Contributions to the bands of both curves: fractions of their variance, as bars.
 
-    Errors of one kind stand together, the levels' among them; kinds that add less than 0.5 % to
+    Errors are grouped by kind, those of levels among them; kinds that add less than 0.5 % to
     both bands share one bar. Bars of one colour sum to the whole variance.
 
     Raises `ValueError` when there is no contribution.
@@ -196,18 +196,18 @@ def contributions_figure(rows: Sequence[Contribution]) -> Figure:
         fractions.append(
             (sum(r.frequency_fraction for r in small), sum(r.damping_fraction for r in small))
         )
-    place = np.arange(len(names))
+    position = np.arange(len(names))
     figure, ((axes,),) = panels(COLUMN, 1.0 + 0.36 * len(names), 1, 1)
     for k, (what, colour) in enumerate((("natural frequency", MEASURED), ("damping", IDENTIFIED))):
         widths = [100 * fraction[k] for fraction in fractions]
-        bars = axes.barh(place + (k - 0.5) * 0.38, widths, 0.36, color=colour, label=what)
+        bars = axes.barh(position + (k - 0.5) * 0.38, widths, 0.36, color=colour, label=what)
         axes.bar_label(bars, [f"{w:.1f} %" for w in widths], padding=2, fontsize=SMALL)
-    axes.set_yticks(place, [plain(name) for name in names])
+    axes.set_yticks(position, [plain(name) for name in names])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     axes.set_xlim(0.0, 1.22 * 100 * max(max(fraction) for fraction in fractions))
     axes.xaxis.set_major_formatter(PercentFormatter(decimals=0))
-    name_axes(axes, "", "Share of the band's variance", "")
+    name_axes(axes, "", "Fraction of the band's variance", "")
     legend(figure)
     return figure
 
@@ -238,16 +238,16 @@ def next_measurements_figure(
     }
     for curve in responses:
         colour = SERIES[forces.index(curve.force) % len(SERIES)]
-        size = np.abs(curve.velocity)
+        speed = np.abs(curve.velocity)
         mine = [
             measurement.velocity for measurement in measurements if measurement.force == curve.force
         ]
-        near = size >= min([0.25 * size.max(), *(0.8 * v for v in mine)])
+        near = speed >= min([0.25 * speed.max(), *(0.8 * v for v in mine)])
         drive = drives.get(curve.force)
         name = with_unit(curve.force, "N") if drive is None else with_unit(drive, "V")
         x = curve.frequency[near] / HERTZ
-        turn = np.angle(sign * curve.velocity[near]) / DEGREE
-        for axes, y in ((speeds, size[near] / unit.size), (phases, turn)):
+        angle = np.angle(sign * curve.velocity[near]) / DEGREE
+        for axes, y in ((speeds, speed[near] / unit.size), (phases, angle)):
             pieces = (curve.stable[near], name, colour, LINE, curve.continued[near])
             response_line(axes, x, y, *pieces)
     for measurement in measurements:
@@ -257,8 +257,8 @@ def next_measurements_figure(
             measurement.velocity / unit.size,
             {**HOLLOW, "clip_on": True},
         )
-        turn = np.angle(sign * np.exp(1j * measurement.phase)) / DEGREE
-        marks(phases, measurement.frequency / HERTZ, turn, HOLLOW)
+        angle = np.angle(sign * np.exp(1j * measurement.phase)) / DEGREE
+        marks(phases, measurement.frequency / HERTZ, angle, HOLLOW)
     for ranks, first in _together(measurements):
         at = (first.frequency / HERTZ, first.velocity / unit.size)
         text = ", ".join(map(str, ranks))

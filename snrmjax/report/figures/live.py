@@ -1,6 +1,6 @@
-"""Live figures: what a page needs to hold them, and the panels that all of them are made of.
+"""Interactive figures: their embedding in a page, and their common panels.
 
-Bokeh draws them (BSD-3). Its program, 1.3 MB, goes into the page: nothing is loaded from outside.
+Bokeh (BSD-3) draws them. Its script, 1.3 MB, is embedded in the page: nothing is loaded.
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ NEEDED = "interactive figures need Bokeh: pip install 'snrmjax[lab]'"
 
 
 def live_figures(layout: "UIElement") -> LiveFigures:
-    """A layout of Bokeh as parts of a page that needs nothing else."""
+    """A Bokeh layout as parts of a self-contained page."""
     from bokeh.embed import components
     from bokeh.resources import Resources
 
-    script, place = components(layout)
-    return LiveFigures(Resources(mode="inline", components=["bokeh"]).render(), place + script)
+    script, container = components(layout)
+    return LiveFigures(Resources(mode="inline", components=["bokeh"]).render(), container + script)
 
 
 def has_bokeh() -> bool:
@@ -120,11 +120,11 @@ def points_by_level(
                 first.js_link("visible", renderer, "visible")
     for (figure, _, _), renderers in zip(panels, drawn, strict=True):
         figure.add_tools(HoverTool(tooltips=list(hover), renderers=renderers))
-    legend_beside(panels[0][0]).click_policy = "hide"
+    legend_at_right(panels[0][0]).click_policy = "hide"
 
 
-def legend_beside(figure: "figure") -> "Legend":
-    """Put the legend of a panel to its right, where it hides nothing; returns it."""
+def legend_at_right(figure: "figure") -> "Legend":
+    """Put the legend to the right of its panel; returns it."""
     legend = figure.legend[0]
     legend.label_text_font_size = _TEXT
     legend.spacing, legend.padding = 0, 4

@@ -37,7 +37,7 @@ _MOST_POINTS = 3000  # of a drawn signal
 
 
 def stabilisation_figure(found: LinearModalFit | DecayModes) -> Figure:
-    """Poles of all model orders over frequency, stable ones marked, and the modes taken."""
+    """Poles of all model orders over frequency, stable ones marked, and the selected modes."""
     figure, grid = panels(PAGE, 3.4, 1, 1)
     axes: Axes = grid[0, 0]
     orders = found.orders
@@ -58,13 +58,13 @@ def stabilisation_figure(found: LinearModalFit | DecayModes) -> Figure:
         axes.set_ylim(0, orders.highest + 1)
     if isinstance(found, LinearModalFit):
         omega = found.curves.omega / HERTZ
-        beside = axes.twinx()
-        size = np.sqrt(np.nansum(np.abs(found.curves.measured) ** 2, axis=0))
-        beside.semilogy(omega, size, color="0.6", linewidth=0.8, zorder=0, label="receptances")
-        beside.set_ylabel(f"Sum of receptances ({_unit(found)})", fontsize=TEXT)
-        beside.tick_params(labelsize=SMALL)
-        beside.spines[["top"]].set_visible(False)
-        axes.set_zorder(beside.get_zorder() + 1)
+        right = axes.twinx()
+        total = np.sqrt(np.nansum(np.abs(found.curves.measured) ** 2, axis=0))
+        right.semilogy(omega, total, color="0.6", linewidth=0.8, zorder=0, label="receptances")
+        right.set_ylabel(f"Sum of receptances ({_unit(found)})", fontsize=TEXT)
+        right.tick_params(labelsize=SMALL)
+        right.spines[["top"]].set_visible(False)
+        axes.set_zorder(right.get_zorder() + 1)
         axes.patch.set_visible(False)
         axes.set_xlim(omega[0], omega[-1])
     elif orders is not None and hertz.size:
@@ -75,14 +75,14 @@ def stabilisation_figure(found: LinearModalFit | DecayModes) -> Figure:
 
 
 def modal_responses_figure(found: LinearModalFit, sensors: Sequence[str] | None = None) -> Figure:
-    """Receptances as measured and as the modes give them, amplitude and phase.
+    """Receptances as measured and as synthesised from the modes, amplitude and phase.
 
     Arguments: `sensors` by name, the four that respond most by default.
     Raises `ValueError` for an unknown sensor.
     """
-    size = np.nanmax(np.abs(found.curves.measured), axis=1)
+    largest = np.nanmax(np.abs(found.curves.measured), axis=1)
     if sensors is None:
-        chosen = sorted(np.argsort(-size)[:_MOST_SENSORS].tolist())
+        chosen = sorted(np.argsort(-largest)[:_MOST_SENSORS].tolist())
     else:
         chosen = [found.sensor_number(name) for name in sensors]
     columns = 1 if len(chosen) == 1 else 2
@@ -95,8 +95,8 @@ def modal_responses_figure(found: LinearModalFit, sensors: Sequence[str] | None 
     style: Style = {"linestyle": "none", "marker": ".", "markersize": 3.0}
     if len(omega) > _DENSE:
         style = {"linestyle": "-", "linewidth": 2.2, "alpha": 0.55}
-    for place, k in enumerate(chosen):
-        row, column = divmod(place, columns)
+    for number, k in enumerate(chosen):
+        row, column = divmod(number, columns)
         upper, lower = grid[2 * row, column], grid[2 * row + 1, column]
         for axes in (upper, lower):
             axes.set_visible(True)
@@ -120,7 +120,7 @@ def modal_responses_figure(found: LinearModalFit, sensors: Sequence[str] | None 
 
 
 def decay_figure(found: DecayModes) -> Figure:
-    """The decays as recorded and as the modes give them."""
+    """The decays as recorded and as synthesised from the modes."""
     names = found.sensors[:_MOST_SENSORS]
     figure, grid = panels(PAGE, 0.8 + 1.7 * len(names), len(names), 1)
     slowest = np.min(found.damping_ratio * found.natural_frequency)
@@ -155,7 +155,7 @@ def _unit(found: LinearModalFit) -> str:
 
 
 def _phase(values: np.ndarray) -> np.ndarray:
-    """Degrees with gaps where the phase turns round."""
+    """Degrees with gaps where the phase wraps."""
     phase = np.degrees(np.angle(values))
     jump = np.abs(np.diff(phase, append=phase[-1])) > 180
     return np.where(jump, np.nan, phase)

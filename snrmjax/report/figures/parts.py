@@ -1,4 +1,4 @@
-"""Figure of a diagnosis by parts: what the states read, the laws that explain it, and the rest."""
+"""Figure of a diagnosis by parts: changes at the states, explaining laws and remainder."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,16 +21,16 @@ from snrmjax.report.style import (
 )
 
 PARTS_CAPTION = (
-    "What every state reads of the change beyond the model, the errors of its level included, "
-    "and the curves that explain it: the laws, and the laws with what is left (95 % band)."
+    "Change relative to the model at every state, the errors of its level included, and the "
+    "curves that explain it: the laws, and the laws with the remainder (95 % band)."
 )
 
 
 def parts_figure(diagnosis: Diagnosis) -> Figure:
     """Changes of stiffness and damping, and other harmonics, beyond the model against velocity.
 
-    Dots are what every state reads, with the errors that its level shares; the dashed line is what
-    the named laws add, the line that and the remainder, with the remainder's 95 % band.
+    Dots are the changes at the states, with the errors common to their level; the dashed line is
+    the named laws, the solid one these and the remainder, with the remainder's 95 % band.
     """
     shown = [one for one in diagnosis.parts if one.remainder is not None]
     n_rows = 1 + (len(shown) > 2)
@@ -49,8 +49,8 @@ def _draw(axes: Axes, part: str, left: Remainder, *, laws: bool) -> None:
     unit, times = unit_for(left.velocity, "m/s"), 100.0
     title = {"stiffness": "Change of stiffness (%)", "damping": "Change of damping ratio (%)"}
     if part not in title:
-        size = np.abs(np.concatenate([left.laws, left.laws + left.value]))
-        own = unit_for(np.maximum(size, 1e-12), "m/s")
+        magnitude = np.abs(np.concatenate([left.laws, left.laws + left.value]))
+        own = unit_for(np.maximum(magnitude, 1e-12), "m/s")
         times, title = 1 / own.size, {part: f"{part.replace('_', ' ').capitalize()} ({own.name})"}
     at, whole = left.velocity / unit.size, times * (left.laws + left.value)
     marks(axes, left.state_velocity / unit.size, times * left.state_change, DOT, "states")
@@ -60,7 +60,7 @@ def _draw(axes: Axes, part: str, left: Remainder, *, laws: bool) -> None:
     if laws:
         law: Style = {"color": SIMULATED, "linestyle": "--"}
         axes.plot(at, times * left.laws, **law, label="laws alone")
-    # States far from resonance read little: the axis is that of the curves and of the others.
+    # States far from resonance are uncertain: the axis follows the curves and the other states.
     states = np.nanquantile(times * left.state_change, [0.25, 0.75])
     reach = np.concatenate([whole, times * left.laws, states])
     margin = 0.5 * max(np.ptp(reach), 1e-3 * np.max(np.abs(reach), initial=1e-9))

@@ -33,7 +33,7 @@ from snrmjax.report.style import (
     unit_for,
 )
 
-_ACROSS = 3  # panels beside one another
+_ACROSS = 3  # panels side by side
 _ROW = 2.4  # inches
 _FRAME = 0.1  # of a decade between a point and the frame
 _TICKS = 12  # intervals between labels, of all panels of a row
@@ -90,8 +90,8 @@ def static_figure(
         for dots, style, name in ((own, DOT, FITTED), (further, HOLLOW, FURTHER)):
             at = largest[k] * dots[:, 1] / unit.size, to_length[k] * dots[:, 0] / unit.size
             marks(axes, at[0], at[1], {**style, "zorder": 3}, name)
-        beside = f"Load, as displacement ({unit.name})" if k % columns == 0 else ""
-        name_axes(axes, names[k], f"Largest displacement ({unit.name})", beside)
+        label = f"Load, as displacement ({unit.name})" if k % columns == 0 else ""
+        name_axes(axes, names[k], f"Largest displacement ({unit.name})", label)
         reach = 1.15 * max(
             np.nanmax(np.abs(x), initial=0.0), np.max(np.abs(every[:, 1])) * largest[k] / unit.size
         )
@@ -124,14 +124,14 @@ def quality_figure(found: Condensation) -> Figure:
     shown = np.isfinite(error) & (error > 0)
     marks(axes, ratio[shown & ~named], error[shown & ~named], DOT, "load case")
     cross = {**CROSS, "markeredgecolor": IDENTIFIED}
-    marks(axes, ratio[shown & named], error[shown & named], cross, "contradicts the others")
+    marks(axes, ratio[shown & named], error[shown & named], cross, "inconsistent with the others")
     if shown.any():
         axes.set(
             xscale="log", yscale="log", xlim=_decades(ratio[shown]), ylim=_decades(error[shown])
         )
     name_axes(
         axes,
-        "Each load case as the fit to all others has it",
+        "Each load case predicted from all others",
         "Nonlinear over linear force",
         "Error over nonlinear force",
     )
@@ -147,7 +147,7 @@ def _decades(values: np.ndarray) -> tuple[float, float]:
 
 
 def scale_figure(study: LoadScaleStudy) -> Figure:
-    """Leading coefficients and misfit over the size of the loads, with the plateau."""
+    """Leading coefficients and misfit over the load scale, with the plateau."""
     figure, grid = panels(PAGE, _ROW + 0.5, 1, 2)
     left, right = grid[0]
     solved = np.isfinite(study.misfit)

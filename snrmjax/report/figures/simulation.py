@@ -96,7 +96,7 @@ def simulated_response_figure(
 def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = None) -> Figure:
     """Events of forced responses over a parameter: their frequency and their velocity amplitude.
 
-    Squares mark where the parameter turns: cusps, births and mergings of isolated responses.
+    Squares mark turning points of the parameter: cusps, births and mergers of isolated responses.
 
     Arguments: `curves` over one parameter; `sensor` by default the first of the curves.
     Returns the figure. Raises `ValueError` when no curve has a point, the curves have several
@@ -112,19 +112,19 @@ def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = Non
         raise ValueError(f"the curves must be over one parameter, but are over {listed}.")
     ((parameter, base),) = parameters
     of = unit_for(np.concatenate([c.value for c in drawn]), "N") if base == "N" else None
-    size, label = (of.size, of.name) if of else (1.0, base)
+    scale, label = (of.size, of.name) if of else (1.0, base)
     below = parameter.replace("_", " ").capitalize() if of else parameter
     below += f" ({unit_in_print(label)})" if unit_in_print(label) else ""
     unit = unit_for(np.concatenate([np.abs(velocity_of(c, name)) for c in drawn]), "m/s")
     figure, ((frequencies, speeds),) = panels(PAGE, 3.2, 1, 2)
     kinds = list(dict.fromkeys(curve.kind for curve in drawn))
     for curve in drawn:
-        x, colour = curve.value / size, SERIES[kinds.index(curve.kind)]
-        turns = np.flatnonzero([bool(event) for event in curve.event])
+        x, colour = curve.value / scale, SERIES[kinds.index(curve.kind)]
+        turning = np.flatnonzero([bool(event) for event in curve.event])
         speed = np.abs(velocity_of(curve, name)) / unit.size
         for axes, y in ((frequencies, curve.frequency / HERTZ), (speeds, speed)):
             axes.plot(x, y, color=colour, **CURVE, label=curve.kind.replace("_", " "))
-            marks(axes, x[turns], y[turns], {**HOLLOW, "marker": "s"}, "turn of the parameter")
+            marks(axes, x[turning], y[turning], {**HOLLOW, "marker": "s"}, "turning point")
     level = f"Velocity amplitude ({unit.name})"
     name_axes(frequencies, "(a) frequency", below, "Frequency (Hz)")
     name_axes(speeds, f"(b) amplitude at {plain(name)}", below, level)
@@ -144,7 +144,7 @@ def quasi_periodic_figure(
     The amplitude of the velocity fundamental goes up and down within the shaded range; behind it
     are the responses with one frequency, unstable ones dashed.
 
-    Arguments: `branches`, and the `curves` that they leave; `sensor` by default the first.
+    Arguments: `branches`, and the `curves` from which they branch; `sensor` by default the first.
     Returns the figure. Raises `ValueError` without a branch or when the sensor is missing.
     """
     if not branches:
@@ -164,7 +164,7 @@ def quasi_periodic_figure(
         )
         begin = with_unit(branch.force, branch.force_unit)
         label = f"two frequencies, {begin}, from {x[0]:.5g} Hz"
-        # A branch may turn in frequency: a polygon, not a band over an axis.
+        # A branch may have turning points in frequency: a polygon, not a band over an axis.
         speeds.fill([*x, *x[::-1]], [*least, *most[::-1]], color=colour, **FILL)
         for edge in (least, most):
             speeds.plot(x, edge, color=colour, **CURVE)
@@ -182,9 +182,9 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     """A nonlinear normal mode: velocity, frequency, and how its shape changes with the energy.
 
     The velocity is shown as amplitude of the fundamental and as peak of the whole signal: they
-    part where an internal resonance puts energy into higher harmonics. Unstable motions are dashed;
-    markers name internal resonances where the other mode has most of the energy. Of several modes a
-    panel shows their shares of it, of several sensors one their fundamentals over the first one's.
+    differ where an internal resonance puts energy into higher harmonics. Unstable motions are
+    dashed; markers name internal resonances where the other mode has most of the energy. Of several modes a
+    panel shows their fractions of it, of several sensors their fundamentals over the first's.
     The energy axes show the last five decades.
 
     Arguments: `sensor` by default the branch's first.
@@ -225,13 +225,15 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
 
 
 def _draw_shapes(branch: NormalModeBranch, fractions: Axes, shapes: Axes, reference: int) -> None:
-    """Shares of the modes in the energy, and fundamentals of the sensors over one of them."""
+    """Energy fractions of the modes, and fundamentals of the sensors over one of them."""
     energy, stable = branch.energy, branch.stability
     seen = np.flatnonzero(branch.mode_fraction.max(axis=0) > _SEEN_FRACTION)
     for k, colour in zip(seen.tolist(), _many_colours(len(seen)), strict=True):
         fraction = 100.0 * branch.mode_fraction[:, k]
         response_line(fractions, energy, fraction, stable, f"mode {k + 1}", colour, LINE)
-    name_axes(fractions, "(c) share of the modes", "Energy (J)", "Share of the kinetic energy (%)")
+    name_axes(
+        fractions, "(c) fractions of the modes", "Energy (J)", "Fraction of the kinetic energy (%)"
+    )
     _energy_axis(fractions, branch)
     if len(branch.sensors) == 1:
         spec = fractions.get_subplotspec()
@@ -250,7 +252,7 @@ def _draw_shapes(branch: NormalModeBranch, fractions: Axes, shapes: Axes, refere
 
 
 def _many_colours(number: int) -> Sequence[Any]:
-    """So many colours that differ."""
+    """This number of different colours."""
     if number <= len(SERIES):
         return SERIES[:number]
     return list(colormaps["viridis"](np.linspace(0.0, 0.9, number)))
@@ -375,15 +377,15 @@ def batch_figure(batch: ResponseBatch) -> Figure:
 
 
 def force_velocity_points(force: np.ndarray, velocity: np.ndarray) -> Figure:
-    """Size and phase of the force of prescribed motions against their velocity amplitude.
+    """Amplitude and phase of the force of prescribed motions against their velocity amplitude.
 
     Arguments: `force` in N and `velocity` in m/s, complex. Returns the figure.
     Raises `ValueError` when no motion was found.
     """
-    found = np.isfinite(force) & np.isfinite(velocity)
-    if not found.any():
+    finite = np.isfinite(force) & np.isfinite(velocity)
+    if not finite.any():
         raise ValueError("there is no force to show: no motion was found.")
-    speed, load = np.abs(velocity[found]), force[found]
+    speed, load = np.abs(velocity[finite]), force[finite]
     unit, newton = unit_for(speed, "m/s"), unit_for(load, "N")
     figure, ((upper,), (lower,)) = panels(COLUMN, 5.0, 2, 1)
     upper.plot(speed / unit.size, np.abs(load) / newton.size, **DOT)

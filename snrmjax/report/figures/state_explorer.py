@@ -1,7 +1,7 @@
-"""All steady states of a test to look at: levels, phases, identified points, and raw records.
+"""Explorer of the steady states of a test: levels, phases, identified points, raw records.
 
-A state that is tapped shows its record folded to one period, with the harmonics that were fitted,
-and the harmonics of its force.
+Tapping a state shows its record folded to one period, with the fitted harmonics and the harmonics
+of its force.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.pipelines.folded_records import FoldedRecord
 from snrmjax.report.figures.live import (
-    legend_beside,
+    legend_at_right,
     live_figures,
     panel,
     points_by_level,
@@ -42,8 +42,8 @@ def state_explorer(
     """Live figures of a test.
 
     Arguments: `found` adds natural frequency and damping of every state; `records`, one a state
-    (None where there is none), adds the raw record of the state that is tapped, at first that of
-    the largest velocity; `sensor` is the column of `data` that is drawn, by default the reference
+    (None where there is none), adds the raw record of the tapped state, initially that of
+    the largest velocity; `sensor` is the column of `data` to draw, by default the reference
     sensor of `found` or the first.
     Raises `ValueError` where Bokeh is missing or `records` are not as many as the states.
     """
@@ -65,14 +65,14 @@ def state_explorer(
     source = ColumnDataSource(columns)
     frequency = "Frequency (Hz)"
     response = panel("Levels", frequency, f"Velocity ({speed.name})")
-    beside = response.x_range
+    shared = response.x_range
     panels = [
         (response, "frequency", "velocity"),
         (
-            panel("Phase", frequency, "Velocity ahead of force (°)", x_range=beside),
+            panel("Phase", frequency, "Velocity ahead of force (°)", x_range=shared),
             *("frequency", "phase"),
         ),
-        (panel("Force", frequency, f"Force ({load.name})", x_range=beside), "frequency", "force"),
+        (panel("Force", frequency, f"Force ({load.name})", x_range=shared), "frequency", "force"),
     ]
     if found is not None:
         name = f"Velocity at resonance ({speed.name})"
@@ -94,7 +94,7 @@ def state_explorer(
 
 
 def _columns(data: SteadyStates, at: int) -> tuple[dict[str, np.ndarray], Unit, Unit]:
-    """What is drawn of every state, and the units of velocity and force."""
+    """The quantities drawn of every state, and the units of velocity and force."""
     velocity = np.where(np.asarray(data.measured)[:, at], np.asarray(data.velocity)[:, at], np.nan)
     force, drive = np.asarray(data.force), np.asarray(data.drive)
     in_volts = not np.isfinite(force).any()
@@ -159,9 +159,9 @@ def _record_panels(
                      legend_label="recorded")  # fmt: skip
         made.line("phase", name, source=shown["fit"], color=IDENTIFIED, width=2,
                   legend_label="fitted harmonics")  # fmt: skip
-        legend_beside(made)
+        legend_at_right(made)
     made = panel("Harmonics of the force", "Harmonic", "Over the fundamental (%)", height=220)
-    made.vbar("order", 0.5, "share", source=shown["orders"], color=_BARS)
+    made.vbar("order", 0.5, "fraction", source=shown["orders"], color=_BARS)
     made.y_range.start = 0
     made.xaxis.ticker = [order for order in orders if order > 1]
     titles = {"samples": response.title, "fit": force.title, "orders": made.title}
@@ -180,12 +180,12 @@ def _record_panels(
 
 
 def _joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Records after one another, in four bytes a number."""
+    """Records concatenated, in four bytes per number."""
     return {name: np.concatenate([part[name] for part in parts]).astype("f4") for name in parts[0]}
 
 
 def _samples(one: FoldedRecord, moved: Unit, load: Unit) -> dict[str, np.ndarray]:
-    """As many samples as are shown, in order of phase."""
+    """The samples shown, in order of phase."""
     rows = np.linspace(0, len(one.phase) - 1, _SAMPLES).round().astype(int)
     rows = rows[np.argsort(one.phase[rows])]
     return {
@@ -197,15 +197,15 @@ def _samples(one: FoldedRecord, moved: Unit, load: Unit) -> dict[str, np.ndarray
 
 def _fitted(one: FoldedRecord, moved: Unit, load: Unit) -> dict[str, np.ndarray]:
     phase = np.linspace(0, 2 * np.pi, _CURVE)
-    turn = np.exp(1j * np.array(one.orders)[:, None] * phase)
+    rotation = np.exp(1j * np.array(one.orders)[:, None] * phase)
     return {
         "phase": np.degrees(phase),
-        "response": (one.response_harmonics @ turn).real / moved.size,
-        "force": (one.force_harmonics @ turn).real / load.size,
+        "response": (one.response_harmonics @ rotation).real / moved.size,
+        "force": (one.force_harmonics @ rotation).real / load.size,
     }
 
 
 def _force_orders(one: FoldedRecord, orders: Sequence[int]) -> dict[str, np.ndarray]:
-    size = {order: abs(one.force_harmonics[one.orders.index(order)]) for order in orders}
-    fraction = [100 * size[order] / size[1] if order > 1 else np.nan for order in orders]
-    return {"order": np.array(orders, dtype=float), "share": np.array(fraction)}
+    magnitude = {order: abs(one.force_harmonics[one.orders.index(order)]) for order in orders}
+    fraction = [100 * magnitude[order] / magnitude[1] if order > 1 else np.nan for order in orders]
+    return {"order": np.array(orders, dtype=float), "fraction": np.array(fraction)}

@@ -48,14 +48,14 @@ def sensitivity_figure(indices: SobolIndices) -> Figure:
     rows = -(-len(shown) // columns)
     height = 0.6 + rows * (0.7 + 0.26 * n)
     figure, grid = panels(PAGE if columns > 1 else COLUMN, height, rows, columns)
-    place = np.arange(n, dtype=float)
+    position = np.arange(n, dtype=float)
     for axes, q in zip(grid.flat, shown, strict=False):
         for shift, values, half, colour, name in (
             (-0.18, indices.first, indices.first_half_width, SERIES[1], "first order"),
             (0.18, indices.total, indices.total_half_width, SERIES[0], "total"),
         ):
             axes.barh(
-                place + shift,
+                position + shift,
                 values[q],
                 height=0.34,
                 xerr=half[q],
@@ -63,11 +63,11 @@ def sensitivity_figure(indices: SobolIndices) -> Figure:
                 error_kw={"linewidth": 0.8},
                 label=f"{name} index, 95 %",
             )
-        axes.set_yticks(place, list(indices.input_names) if q in shown[::columns] else [""] * n)
+        axes.set_yticks(position, list(indices.input_names) if q in shown[::columns] else [""] * n)
         axes.tick_params(axis="y", labelsize=SMALL)
         axes.set_xlim(0.0, 1.05)
         axes.invert_yaxis()
-        name_axes(axes, _label(indices.names[q]), "Share of the variance", "")
+        name_axes(axes, _label(indices.names[q]), "Fraction of the variance", "")
     for axes in grid.flat[len(shown) :]:
         axes.set_visible(False)
     legend(figure)

@@ -1,1 +1,1 @@
-"""Pages: what a report of each result tells, and the files beside it."""
+"""Pages: the report of each result, and the files written with it."""

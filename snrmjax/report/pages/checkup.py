@@ -1,4 +1,4 @@
-"""What a check found: check.json and its lines."""
+"""Findings of a check: check.json and the printed lines."""
 
 from pathlib import Path
 
@@ -12,9 +12,9 @@ def write(folder: Path, found: Checkup) -> None:
 
 
 def headline(found: Checkup) -> list[str]:
-    """Each finding with its evidence and what mends it."""
+    """Each finding with its evidence and remedy."""
     lines = []
     for finding in found.findings:
         lines.append(f"{finding.severity}: {finding.kind} in {finding.where}: {finding.evidence}")
-        lines.append(f"  mend: {finding.advice}")
+        lines.append(f"  remedy: {finding.advice}")
     return lines or ["nothing found"]

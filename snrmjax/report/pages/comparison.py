@@ -39,10 +39,10 @@ _NAMES = {
     "pnlss": "nonlinear state space",
 }
 _EVERY = (*METHODS, *RECORD_METHODS)
-# Curves at amplitudes of their own choice are lines, answers state by state are points.
+# Methods that give curves are drawn as lines, those that answer state by state as points.
 _LINES = {"snrm": "-", "restoring_force": "--", "ssm": "-.", "pnlss": ":"}
 _MARKERS = ("o", ".", "s", "D", "^", "v", "x")
-# Methods whose 1σ knows noise alone, and those that also take all forces for polynomials.
+# Methods whose 1σ includes noise only, and those that also assume polynomial forces.
 _OF_NOISE = ("concerto", "arslan_ozguven", "rct", "phase_resonance")
 _OF_POLYNOMIALS = ("pnlss",)
 _AWAY = ("median_distance_from_snrm_hz", "median_relative_damping_distance_from_snrm")
@@ -83,7 +83,7 @@ def write(folder: Path, found: Comparison, *, title: str = "", model: str = "") 
 
 
 def headline(found: Comparison) -> list[str]:
-    """What each record was taken for, what lies beside the mode in decays, and the result."""
+    """How each record was classified, interfering modes of decays, and the result."""
     return [*map(str, (*found.records, *found.decays)), comparison_sentence(found)]
 
 
@@ -93,7 +93,7 @@ def notes_of(found: Comparison) -> list[str]:
 
 
 def _done(found: Comparison) -> list[tuple[str, str]]:
-    """What was given, in the line under the title."""
+    """The inputs, for the line under the title."""
     rows = []
     data, records = found.data, found.records
     if data is not None:
@@ -174,7 +174,7 @@ def _notes(found: Comparison) -> list[str]:
 
 
 def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
-    """Sentences on bands that do not hold all errors of their method."""
+    """Sentences on bands that do not include all errors of their method."""
     banded = [
         result.method
         for result in results
@@ -187,13 +187,13 @@ def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
     notes = []
     if noise:
         notes.append(
-            f"the bands of {noise} hold noise alone: what the method itself neglects is not in "
-            "them, and is the larger part where there is little noise."
+            f"the bands of {noise} include noise only: what the method itself neglects is not in "
+            "them, and dominates where noise is low."
         )
     if polynomial:
         notes.append(
-            f"the bands of {polynomial} hold noise alone and take the forces for polynomials: "
-            "with friction, stops or damping by v|v| they are too narrow."
+            f"the bands of {polynomial} include noise only and assume polynomial forces: with "
+            "friction, stops or v|v| damping they are too narrow."
         )
     return notes
 

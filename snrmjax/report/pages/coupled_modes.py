@@ -1,4 +1,4 @@
-"""What a test says of modes that exchange energy: files, headline, figures and section."""
+"""Modes that exchange energy in a test: files, headline, figures and section."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,16 +31,16 @@ from snrmjax.report.style import (
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 
 _TEXT = (
-    "Motions of both modes are held as the sensors have them, and the coefficients of a potential "
-    "are fitted to the forces that each mode asks for; which terms are there follows from their "
-    "evidence."
+    "The motions of both modes are prescribed as the sensors measured them, and the coefficients "
+    "of a potential are fitted to the forces that each mode requires; its terms are selected by "
+    "their evidence."
 )
 _SHAPE_CAPTION = (
-    "Identified curves of one mode and those of the coupled modes (grey), and the shape of the "
-    "coupled mode: velocities of the sensors over that of the reference."
+    "Curves identified for a single mode and for the coupled modes (grey), and the shape of the "
+    "coupled mode: sensor velocities relative to the reference."
 )
 _RESPONSE_CAPTION = (
-    "Responses of the coupled modes under the forces that were asked for, by harmonic balance: "
+    "Responses of the coupled modes under the requested forces, by harmonic balance: "
     "triangles mark peaks, squares folds, dots phase resonances."
 )
 
@@ -50,16 +50,14 @@ def headline(found: CoupledDetails) -> list[str]:
     lines = []
     for curve in found.responses:
         for k in curve.at_events("peak"):
-            size = np.abs(curve.velocity[k, 1, _reference(found, curve)])
-            place = f"{curve.frequency[k] / HERTZ:.5g} Hz, {size:.3g} m/s"
-            lines.append(
-                f"peak of the coupled modes at {curve.force:g} {curve.force_unit}: {place}"
-            )
+            speed = np.abs(curve.velocity[k, 1, _reference(found, curve)])
+            peak = f"{curve.frequency[k] / HERTZ:.5g} Hz, {speed:.3g} m/s"
+            lines.append(f"peak of the coupled modes at {curve.force:g} {curve.force_unit}: {peak}")
     return lines
 
 
 def write(folder: Path, found: CoupledDetails) -> dict[str, object]:
-    """Write model and predictions into a folder; returns what the summary says."""
+    """Write model and predictions into a folder; returns the entries of the summary."""
     fit, sensor = found.modes.calibration, found.bias.sensors[_first(found.modes)]
     write_model(folder / "model.toml", fit.model)
     if found.responses:
@@ -100,7 +98,7 @@ def figures(found: CoupledDetails, backbone: Backbone) -> dict[str, Figure]:
 
 
 def section(found: CoupledDetails, drawn: Mapping[str, Figure | PrintedFigure]) -> Section:
-    """The part of the page."""
+    """The section of the page."""
     fit = found.modes.calibration
     rows = [
         (name, with_error(float(value), float(std)), unit_in_print(parameter_unit(fit.model, name)))
@@ -139,6 +137,6 @@ def _backbone_figure(found: CoupledDetails, backbone: Backbone) -> Figure:
         right.plot(column, speed, color=colour, lw=LINE, label=name)
     name_axes(left, "natural frequency", "Frequency (Hz)", f"Velocity ({unit.name})")
     name_axes(middle, "damping", "Damping ratio (%)", "")
-    name_axes(right, "shape of the coupled mode", "Velocity over the reference's", "")
+    name_axes(right, "shape of the coupled mode", "Velocity / reference velocity", "")
     legend(figure)
     return figure

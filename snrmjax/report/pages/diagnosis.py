@@ -9,14 +9,14 @@ from matplotlib.figure import Figure
 
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.fitted_effects import TriedEffect
-from snrmjax.diagnose.location.where import Localisation, PlacedForce
+from snrmjax.diagnose.location.where import Localisation, LocatedForce
 from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.detection import beyond_data
 from snrmjax.diagnose.priors import AS_NOISE
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
-    holds_response,
+    is_response_controlled,
 )
 from snrmjax.diagnose.verdict import NOISE_REJECTED, NONE, UNKNOWN, Verdict
 from snrmjax.io import diagnosis_results as written
@@ -28,12 +28,12 @@ from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS, effect_class
 from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
 from snrmjax.report.figures.diagnosis import (
-    HELD_CAPTION,
+    CONTROLLED_CAPTION,
     candidates_figure,
     comparison_figure,
+    controlled_velocity_figure,
     effect_laws_figure,
     found_effects,
-    held_velocity_figure,
     misfit_figure,
 )
 from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
@@ -67,46 +67,46 @@ from snrmjax.report.sentences.diagnose import probability_in_words as in_words
 from snrmjax.report.style import PrintedFigure, save_figures, unit_for, with_unit
 
 _SHOWN = 10  # candidates
-_LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
+_LEAST_P_VALUE = 1e-12  # smaller ones are not distinguished
 
 _CAPTIONS = {
     "laws": (
-        "What the completed model adds, over the measured range of motion. Forces are those that "
-        "would have to act at the drive to do the same to the mode."
+        "Forces that the completed model adds, over the measured range of motion, expressed as the "
+        "equivalent force at the drive point."
     ),
     "responses": (
-        "Responses at the force of every level, without and with the effects that were found, over "
+        "Responses at the force of every level, without and with the identified effects, over "
         "the measured states. Lines should pass through the dots."
     ),
     "residuals": (
-        "How far the force that each measured state needs is from the one that acted, in standard "
-        "deviations of the noise (of its size alone where the phase is unknown). A correct model "
+        "Force that each measured state requires minus the force that acted, in standard "
+        "deviations of the noise (magnitudes only where the phase is unknown). A correct model "
         "leaves about 1 everywhere; dark regions show where the model is wrong."
     ),
     "parts": PARTS_CAPTION,
     "candidates": (
-        "How much better each effect, added alone, makes the model: gain of the Bayesian "
-        "information criterion. Left of the dashed line an effect is not detected; vermilion bars "
-        "are effects of the answer, or what the data cannot tell from them. Several effects "
-        "together may explain more than the longest bar."
+        "Improvement of the model by each effect added alone: gain of the Bayesian information "
+        "criterion. Left of the dashed line an effect is not detected; vermilion bars are effects "
+        "of the answer, or not distinguishable from them. Several effects together may "
+        "explain more than the longest bar."
     ),
 }
 _PROBABILITIES = (
-    "The most probable answers, by how well each explains these data with all its parameters "
-    "uncertain. All answers considered add up to 100 %."
+    "The most probable answers, by their evidence: how well each explains these data on average "
+    "over its uncertain parameters. All answers considered add up to 100 %."
 )
 _ONLY_AS_STATED = "; the ± holds only if the noise is as stated"
 _OTHER_ANSWERS = {
     NONE: "nothing is missing",
-    UNKNOWN: "something that no effect of the library explains",
+    UNKNOWN: "something that no effect in the library explains",
     NOISE_REJECTED: "the noise is not as stated",
 }
 
 
 def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = "") -> Report:
-    """Write all that is told of a diagnosis: diagnosis.json, model.toml, figures and page.
+    """Write the results of a diagnosis: diagnosis.json, model.toml, figures and page.
 
-    Where no structure can have the parameters found, there is no `model.toml`.
+    Where the parameters are not physical, there is no `model.toml`.
     """
     diagnosis, predicted = found.diagnosis, found.predicted
     figures = diagnosis_figures(diagnosis)
@@ -132,19 +132,19 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
         done={"data": data, "model": found.model.name},
     )
     if found.where is not None:
-        report = report._replace(sections=[_place_section(found.where), *report.sections])
+        report = report._replace(sections=[_location_section(found.where), *report.sections])
     write_report(folder / "report.html", report)
     return report
 
 
-def _place_section(where: Localisation) -> Section:
-    """The places with their probabilities, and the law that explains the sensors best at each."""
+def _location_section(where: Localisation) -> Section:
+    """Attachment points with probabilities, and the law that best explains the sensors at each."""
     rows = []
     for place in where.places:
         law = "" if place.law is None else effect_name(place.law.kind)
         rows.append((place.name, in_words(place.probability), law))
-    table = ReportTable(("place", "probability", "law there"), rows, "Where the force acts")
-    return Section("Where it is", (str(where.words),), (), [table])
+    table = ReportTable(("location", "probability", "law there"), rows, "Where the force acts")
+    return Section("Location of the force", (str(where.words),), (), [table])
 
 
 def answer_in_words(found: DiagnosedTest) -> str:
@@ -159,16 +159,19 @@ def answer_in_words(found: DiagnosedTest) -> str:
 
 
 def headline(found: DiagnosedTest) -> list[str]:
-    """Verdict, values of what was found, probability, and what would decide an open answer."""
+    """Verdict, values of its effects, probability, and what would decide an open answer."""
     diagnosis = found.diagnosis
     values = _effects_with_values(diagnosis)
     lines = [
         diagnosis.verdict_sentence,
-        *([f"{_attempt(diagnosis, 'found')} (± 1σ): {values}"] if values else []),
+        *([f"{_attempt(diagnosis, 'identified')} (± 1σ): {values}"] if values else []),
         f"probability: {diagnosis.most_probable()}",
     ]
     if found.is_placed and found.where is not None:
-        lines = [str(found.where.answer), f"found (± 1σ): {_placed_values(found.where.places[0])}"]
+        lines = [
+            str(found.where.answer),
+            f"identified (± 1σ): {_located_values(found.where.places[0])}",
+        ]
     elif diagnosis.decide_by:
         lines.append(f"what would decide: {diagnosis.decide_by}")
     if found.where is not None:
@@ -182,19 +185,22 @@ def _attempt(diagnosis: Diagnosis, answer: str) -> str:
 
 
 def _effects_with_values(diagnosis: Diagnosis) -> str:
-    """The effects that were found with their parameters, in one line; "" where none has any."""
+    """The identified effects with their parameters, in one line; "" where none has any."""
     values = {kind: values_in_words(kind, diagnosis.parameters) for kind in diagnosis.effects}
     line = "; ".join(f"{effect_name(kind)}, {text}" for kind, text in values.items() if text)
     return line + (_ONLY_AS_STATED if line and diagnosis.gap.after > AS_NOISE else "")
 
 
-def _placed_values(place: PlacedForce) -> str:
-    """The law at a place with its parameters, in one line."""
+def _located_values(place: LocatedForce) -> str:
+    """The law at a point with its parameters, in one line."""
     law = place.law
     if law is None:
         return ""
     pairs = {f"{law.kind}.{name}": (value, law.std[name]) for name, value in law.parameters.items()}
-    return f"{effect_name(law.kind)} at {place.name}, {values_in_words(law.kind, pairs, place.row)}"
+    return (
+        f"{effect_name(law.kind)} at {place.name}, "
+        f"{values_in_words(law.kind, pairs, place.influence)}"
+    )
 
 
 def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure:
@@ -204,7 +210,7 @@ def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure
     _, before, after = simulated.predicted
     if simulated.held is None:
         return comparison_figure(before, after, data, sensor=sensor)
-    return held_velocity_figure(*simulated.held, data, sensor)
+    return controlled_velocity_figure(*simulated.held, data, sensor)
 
 
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
@@ -238,8 +244,8 @@ def diagnosis_report(
     `predicted` resonances of the levels; `done` names the inputs.
     """
     captions = {**_CAPTIONS} | ({"laws": LAW_CAPTION} if diagnosis.answer.laws else {})
-    if holds_response(diagnosis.data, predicted):
-        captions["responses"] = HELD_CAPTION
+    if is_response_controlled(diagnosis.data, predicted):
+        captions["responses"] = CONTROLLED_CAPTION
     shown = {name: ReportFigure(figure, captions[name]) for name, figure in figures.items()}
     return Report(
         title=title,
@@ -269,21 +275,21 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
     misfit = f"{_times(gap.before)} → {_times(gap.after)} × noise"
     if diagnosis.effects and gap.after > AS_NOISE:
         misfit += _ONLY_AS_STATED
-    rows.append(("misfit of the force (rms), errors of levels and laws in it", misfit))
+    rows.append(("misfit of the force (rms), with errors of levels and laws", misfit))
     if np.isfinite(np.asarray(relative_errors(jax.tree.map(np.asarray, diagnosis.data)))).any():
         rows.append(
             (
-                "random part of it, by neighbouring states",
-                f"{_times(diagnosis.checks.noise_scale)} × noise, errors of whole levels apart",
+                "random part of it, from neighbouring states",
+                f"{_times(diagnosis.checks.noise_scale)} × noise, errors of whole levels excluded",
             )
         )
     rows.append(("probability of this answer", in_words(diagnosis.probability)))
-    for place, out in (
-        ("misfit of a level between others", gap.interpolated),
+    for what, out in (
+        ("misfit of an intermediate level", gap.interpolated),
         ("misfit of the largest level", gap.extrapolated),
     ):
         if out:
-            name = f"{place} (level {out.level}), left out"
+            name = f"{what} (level {out.level}), left out"
             text = f"{_times(out.before)} → {_times(out.after)} × its prediction error"
             rows.append((name, text))
     if predicted:
@@ -291,7 +297,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
         pairs = [("measured", top.measured), ("model as given", top.before)]
         pairs.append(("completed model", top.completed))
         if top.held_out:
-            pairs.append((f"predicted without having seen level {top.level}", top.after))
+            pairs.append((f"predicted without level {top.level}", top.after))
         unit = velocity_unit(one for _, one in pairs)
         text = "; ".join(f"{name}: {resonance_in_words(one, unit)}" for name, one in pairs)
         rows.append((f"resonance at {with_unit(top.force, diagnosis.data.force_unit)}", text))
@@ -301,14 +307,14 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
 
 
 def _effects_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) -> Section:
-    """What was found: what it is physically, its law, its parameters."""
+    """The identified effects: their physical meaning, laws and parameters."""
     text = []
     for kind, group in zip(diagnosis.effects, diagnosis.candidates, strict=True):
         name = effect_name(kind)
         text.append(f"{name[0].upper()}{name[1:]}. {_description(kind)}")
         others = [effect_name(other) for other in group if other != kind]
         if others:
-            text[-1] += f" These data do not tell it from: {', '.join(others)}."
+            text[-1] += f" Not distinguishable in these data: {', '.join(others)}."
     rows = [
         (effect_name(kind), parameter_meaning(kind, name), *value_and_unit(kind, name, pair))
         for kind in diagnosis.effects
@@ -317,7 +323,7 @@ def _effects_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) ->
     caption = "Parameters of the effects ± 1σ, as model.toml has them."
     if diagnosis.gap.after > AS_NOISE:
         caption += (
-            " The ± holds only if the noise is as stated, but the misfit that is left is "
+            " The ± holds only if the noise is as stated, but the remaining misfit is "
             f"{_times(diagnosis.gap.after)} times that noise."
         )
     table = ReportTable(("effect", "parameter", "value ± 1σ", "unit"), rows, caption)
@@ -336,13 +342,13 @@ def _comparison_section(
     if predicted:
         header = ["level", "force", "measured", "model as given", "completed model"]
         caption = (
-            "Phase resonances of the levels: frequency, velocity amplitude and, of models, the "
+            "Phase resonances of the levels: frequency, velocity amplitude and, for models, the "
             "fold where the branch ends. Where no phase was measured: the state with the largest "
-            "velocity over force."
+            "ratio of velocity to force."
         )
         if any(row.held_out for row in predicted):
-            header.append("predicted without having seen the level")
-            caption += " The last column is of models that were fitted without that level."
+            header.append("predicted without this level")
+            caption += " The last column is from models fitted without that level."
         tables.append(
             ReportTable(header, resonance_rows(predicted, diagnosis.data.force_unit), caption)
         )
@@ -366,7 +372,7 @@ def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure])
     ]
     tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
     figures = [shown["candidates"]] if "candidates" in shown else []
-    return Section("What else was considered", (), figures, tables)
+    return Section("Other answers considered", (), figures, tables)
 
 
 def _step(number_of: int, count: int) -> str:
@@ -382,16 +388,16 @@ def _limits_section(diagnosis: Diagnosis) -> Section:
         scales = scales_of_motions(modes, misfit.sensor, *of_states)
     for name, limit in sorted(diagnosis.detection_limits.items()):
         kind, parameter = name.split(".", 1)
-        size = (number(limit, 2), printed_unit(kind, parameter))
+        from_value = (number(limit, 2), printed_unit(kind, parameter))
         if beyond_data(EFFECTS[kind], limit, scales):
-            size = ("not detectable in these data", "")
-        rows.append((effect_name(kind), parameter_meaning(kind, parameter), *size))
+            from_value = ("not detectable in these data", "")
+        rows.append((effect_name(kind), parameter_meaning(kind, parameter), *from_value))
     table = ReportTable(
         ("effect", "parameter", "detected from", "unit"),
         rows,
         folded=f"Detection limits of {len(rows)} further effects",
     )
-    text = "Effects larger than these limits would have been detected beside what was found."
+    text = "Effects larger than these limits would have been detected in addition to the answer."
     return Section("What would have been detected", [text], (), [table])
 
 
@@ -425,7 +431,7 @@ _PARTS = {
     "harmonic_2": "The second harmonic of the velocity differs from the model's",
     "harmonic_3": "The third harmonic of the velocity differs from the model's",
     "not_a_function_of_amplitude": (
-        "A part of the misfit is no function of the amplitude: it differs between states of one "
+        "A part of the misfit is not a function of amplitude: it differs between states of equal "
         "amplitude"
     ),
 }
@@ -434,7 +440,7 @@ _PARTS = {
 def _located(part: Located, misfit: float = 1.0) -> str:
     """One part of the disagreement as a sentence.
 
-    The 1σ of its power of amplitude is widened by the misfit that is left, in units of noise.
+    The 1σ of its power of amplitude is widened by the remaining misfit, in units of noise.
     """
     unit = unit_for(part.velocity_range, "m/s")
     low, high = (f"{one / unit.size:.3g}" for one in part.velocity_range)

@@ -31,33 +31,33 @@ from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 
 GAIN_NOT_IN_BANDS = (
-    " A wrong gain of force or velocity, which scales all damping ratios alike, is not in them."
+    " A gain error of force or velocity, which scales all damping ratios alike, is not in them."
 )
-NO_SCATTER = "none found beyond the noise"
+NO_SCATTER = "none beyond the noise"
 _BACKBONE_CAPTION = (
     "Backbone. Blue dots are measured steady states. Each gives one star: (a) the natural "
     "frequency at its amplitude, (b) the phase resonance at 0°, (c) the damping ratio. "
     "{line} Check that the stars lie on one line "
-    "whatever the phase of their dots: stars that spread with phase at one amplitude mean that the "
-    "method's assumptions do not hold. Grey crosses are steady states left out of the curves."
+    "regardless of phase: a spread with phase at one amplitude means that the assumptions of the "
+    "method do not hold. Grey crosses are steady states left out of the curves."
 )
 RESPONSE_CAPTION = (
-    "Predicted responses, one row a force. Thin dashed parts are unstable: a test without control "
-    "jumps before it gets there. Pale parts lie beyond the measured amplitudes, where the curves "
-    "are extrapolated. The star is the phase resonance. Broad grey lines are harmonic balance with "
-    "the true model, blue dots measured steady states under the same force, where there are any: "
-    "both should coincide with the prediction."
+    "Predicted responses, one row per force. Thin dashed parts are unstable: a test without "
+    "control jumps before it reaches them. Pale parts lie beyond the measured amplitudes, where "
+    "the curves are extrapolated. The star is the phase resonance. Broad grey lines are harmonic "
+    "balance with the true model, blue dots measured steady states under the same force, where "
+    "there are any: both should coincide with the prediction."
 )
 TRUTH_CAPTION = (
     " The dashed black line is the true nonlinear mode of the model. Where it leaves the backbone "
-    "and comes back, an internal resonance moves energy into another mode."
+    "and returns, an internal resonance transfers energy to another mode."
 )
 _VALIDITY = (
-    "The method takes one mode as nonlinear and all others as linear. It needs a well-separated "
-    "mode whose shape keeps its form, and no internal resonance in the range of the test; natural "
-    "frequency and damping must depend on the amplitude alone, not on the history of the test.",
+    "The method treats one mode as nonlinear and all others as linear. It needs a well-separated "
+    "mode of constant shape, and no internal resonance in the range of the test; natural "
+    "frequency and damping must depend on the amplitude only, not on the history of the test.",
     "Phases are those of the velocity relative to the force: 0° is the phase resonance, positive "
-    "means that the velocity leads. The paper's angle is this one minus 90°.",
+    "means that the velocity leads. The angle in the paper is this one minus 90°.",
     "Amplitudes are peak amplitudes of the fundamental harmonic. The natural frequency belongs to "
     "the displacement amplitude, which is the velocity over the frequency of the force. A point "
     "measured at velocity v and angular frequency Ω therefore lies on the backbone at the velocity "
@@ -69,7 +69,7 @@ _VALIDITY = (
 
 
 class CurveWords(NamedTuple):
-    """What a report says of its curves: how they are drawn, what bands hold, which errors."""
+    """Texts of a report on its curves: how they are drawn, bands, noise and scatter."""
 
     line: str
     bands: str
@@ -79,21 +79,21 @@ class CurveWords(NamedTuple):
 
     @property
     def caption(self) -> str:
-        """Of the figure of backbone and damping."""
+        """Caption of the figure of backbone and damping."""
         return _BACKBONE_CAPTION.format(line=self.line)
 
     @property
     def validity(self) -> list[str]:
-        """How the report is read, and when it is trusted."""
+        """Interpretation and validity of the report."""
         return [text.format(bands=self.bands) for text in _VALIDITY]
 
 
 def words_of_points(identification: Identification) -> CurveWords:
-    """Of curves through the points of single states."""
+    """Texts on curves through the points of single states."""
     return CurveWords(
         line="The line is the curve through the stars, the band its 95 % range.",
-        bands="Error bars and bands are 95 %. They hold random errors only: stated noise, or the "
-        "scatter of the points where none was stated, and what the points of one level share."
+        bands="Error bars and bands are 95 %. They include random errors only: stated noise or, "
+        "where none was stated, the scatter of the points, and errors common to one level."
         f"{GAIN_NOT_IN_BANDS}",
         noise=noise_in_words(identification.fit.noise, "measured phasor"),
         scatter=_level_scatter(identification),
@@ -102,7 +102,7 @@ def words_of_points(identification: Identification) -> CurveWords:
 
 
 def noise_in_words(noise: NoiseEstimate, of: str) -> str:
-    """The noise that was stated, or found in per cent `of` something."""
+    """The noise as stated, or as estimated in per cent `of` something."""
     if noise.stated:
         scale = with_error(noise.scale, noise.scale_std)
         return f"stated; states scatter about the curves by {scale} times as much"
@@ -111,7 +111,7 @@ def noise_in_words(noise: NoiseEstimate, of: str) -> str:
 
 
 class ComparedResponses(NamedTuple):
-    """Responses that identified curves predict, and those of harmonic balance beside them."""
+    """Responses predicted from identified curves, and those of harmonic balance to compare."""
 
     predicted: Sequence[PredictedResponse] = ()
     resonances: Sequence[Resonance] = ()
@@ -134,9 +134,9 @@ def identification_report(
     """The report of an identification: numbers, notes, backbone, predictions, validity.
 
     Arguments: `figures` by name: `backbone`, `prediction` where there are responses, and `nnm`
-    where the backbone is drawn beside the true nonlinear mode; `done` names what was done (data
+    where the backbone is compared with the true nonlinear mode; `done` names the inputs (data
     file, model, options); `notes` come before those of the identification; `responses` under the
-    forces that were asked for; `further` sections before the last one; `words` on curves that do
+    requested forces; `further` sections before the last one; `words` on curves that do
     not go through the points.
     Returns a `Report` for `write_report`.
     """
@@ -168,7 +168,7 @@ def identification_report(
 
 
 class _Course(NamedTuple):
-    """How a curve runs over the amplitudes, with 95 % errors."""
+    """A curve over the amplitudes, with 95 % errors."""
 
     velocity: np.ndarray  # m/s
     values: np.ndarray
@@ -179,7 +179,7 @@ class _Course(NamedTuple):
         """Where it is lowest and highest."""
         return int(np.nanargmin(self.values)), int(np.nanargmax(self.values))
 
-    def turns(self) -> bool:
+    def has_inner_extreme(self) -> bool:
         """Whether its lowest or highest value lies between the ends, beyond the errors."""
         ends = self.values[[0, -1]]
         low, high = self.extreme()
@@ -191,7 +191,7 @@ class _Course(NamedTuple):
     def words(self) -> str:
         """Its course in words."""
         first, last = self.values[[0, -1]]
-        if self.turns():
+        if self.has_inner_extreme():
             low, high = self.extreme()
             at = [with_unit(self.velocity[k], "m/s", 3) for k in (low, high)]
             return (
@@ -214,7 +214,7 @@ def _courses(identification: Identification) -> tuple[_Course, _Course]:
 
 
 def identification_sentence(identification: Identification, modes: LinearModes) -> str:
-    """What an identification found, in one plain sentence."""
+    """The result of an identification in one plain sentence."""
     frequency, damping = _courses(identification)
     unit = unit_for(frequency.velocity, "m/s")
     low, high = (f"{one / unit.size:.3g}" for one in frequency.velocity[[0, -1]])
@@ -246,7 +246,7 @@ def identification_summary(
 
     def ends(course: _Course) -> str:
         pairs = [(with_error(course.values[k], course.errors[k]), at(course, k)) for k in (0, -1)]
-        return ", ".join(f"{value} {place}" for value, place in pairs)
+        return ", ".join(f"{value} {where}" for value, where in pairs)
 
     def extremes(course: _Course) -> str:
         return " to ".join(f"{course.values[k]:.4g} {at(course, k)}" for k in course.extreme())
@@ -266,9 +266,9 @@ def identification_summary(
         ("scatter from level to level", words.scatter),
         ("argument of the curves", words.argument),
     ]
-    if frequency.turns():
+    if frequency.has_inner_extreme():
         rows.insert(2, ("lowest to highest frequency", extremes(frequency)))
-    if damping.turns():
+    if damping.has_inner_extreme():
         at_damping = [name for name, _ in rows].index("damping ratio (± 95 %)")
         rows.insert(at_damping + 1, ("lowest to highest damping", extremes(damping)))
     return [(name, text) for name, text in rows if text]
@@ -309,7 +309,7 @@ def resonance_table(
 ) -> ReportTable:
     """Predicted phase resonances, with harmonic balance's nearest one under the same force.
 
-    Arguments: `forces` that were asked for: those without a resonance get a row that says so.
+    Arguments: requested `forces`: those without a resonance get a row of their own.
     """
     pairs: list[tuple[float, Resonance | None]] = [
         (resonance.force, resonance) for resonance in resonances
@@ -332,14 +332,14 @@ def resonance_table(
             continue
         row += [f"{one.velocity / unit.size:.4g}", f"{one.frequency / HERTZ:.5g}"]
         row += [f"{100 * one.damping_ratio:.3g}", "yes" if one.continued else "no"]
-        rows.append(row + (_beside(one, simulated, backbone.sensor, unit) if simulated else []))
-    caption = "Phase resonances: here the mode moves in phase with the force."
+        rows.append(row + (_compared(one, simulated, backbone.sensor, unit) if simulated else []))
+    caption = "Phase resonances: the velocity of the mode is in phase with the force."
     if simulated:
         caption += " Differences are the prediction minus the nearest one of harmonic balance."
     return ReportTable(header, rows, caption)
 
 
-def _beside(
+def _compared(
     one: Resonance, simulated: Sequence[ResponseCurve], sensor: str, unit: Unit
 ) -> list[str]:
     """Harmonic balance's phase resonance nearest to a predicted one, and the differences."""

@@ -1,4 +1,4 @@
-"""An identification in full: its figures, its page, and the files that are written of it."""
+"""A complete identification: its figures, page and files."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,7 +42,7 @@ def settings_in_words(found: IdentifiedTest) -> dict[str, str]:
 
 
 def headline(found: IdentifiedTest) -> list[str]:
-    """What was found, in lines to be read as soon as the command ends."""
+    """The results as the lines printed when the command ends."""
     values = found.values
     speed, ratio = np.asarray(values.velocity), 100 * np.asarray(values.damping_ratio)
     hertz = np.asarray(values.natural_frequency) / HERTZ
@@ -56,9 +56,9 @@ def headline(found: IdentifiedTest) -> list[str]:
     lines = [f"backbone: {ends[0]} to {ends[1]} (± 95 %)"]
     for prediction in found.predictions:
         for each in prediction.resonances:
-            place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
+            resonance = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
             damped = f"{100 * each.damping_ratio:.3g} % of critical damping"
-            lines.append(f"resonance at {prediction.load}: {place}, {damped}")
+            lines.append(f"resonance at {prediction.load}: {resonance}, {damped}")
         lines.append(f"resonance at {prediction.load}: {where_in_words(prediction.further)}")
     if found.coupled is not None:
         lines += coupled_page.headline(found.coupled)
@@ -66,8 +66,8 @@ def headline(found: IdentifiedTest) -> list[str]:
         force, drive = advised.force, advised.drive
         unit = found.model.modes.force_unit
         load = f"force {force:.4g} {unit}" if drive is None else f"drive {drive:.4g} V"
-        place = f"{load}, {advised.frequency / HERTZ:.6g} Hz (expected {advised.expected})"
-        lines.append(f"measure next, {advised.rank}: {place}: {advised.reason}")
+        state = f"{load}, {advised.frequency / HERTZ:.6g} Hz (expected {advised.expected})"
+        lines.append(f"measure next, {advised.rank}: {state}: {advised.reason}")
     return lines
 
 
@@ -130,12 +130,12 @@ LOOPS_CAPTION = (
     "resonance, the wider the farther from it."
 )
 DAMPING_CAPTION = (
-    "Modal damping 2ζω against amplitude. Linear damping gives a constant near the dotted line, "
-    "whatever the stiffness does; harmonics of the motion add a few per cent."
+    "Modal damping 2ζω against amplitude. Linear damping is constant near the dotted line, "
+    "whatever the stiffness; harmonics of the motion add a few per cent."
 )
 MODE_CAPTION = (
     "The nonlinear normal mode of the model, followed by harmonic balance: velocity against "
-    "frequency, frequency against energy and, of several modes, how the energy is shared among "
+    "frequency, frequency against energy and, of several modes, how the energy is distributed over "
     "them. Dashed parts are unstable; a marker names an internal resonance."
 )
 
@@ -146,11 +146,11 @@ def findings_report(
     done: dict[str, str],
     figures: Mapping[str, Figure | PrintedFigure],
 ) -> Report:
-    """The report of an identification; `done` says what was done with which files."""
+    """The report of an identification; `done` names data, model and settings."""
     further = [] if found.joint is None else joint_sections(found.joint, figures)
     further.append(
         Section(
-            "What was measured, and its damping",
+            "Measured states and damping",
             (),
             [
                 ReportFigure(figures["loops"], LOOPS_CAPTION),
@@ -188,7 +188,7 @@ def write(
     model: str = "",
     axis: str = "velocity",
 ) -> Report:
-    """Write what an identification found into a folder: tables, summary, figures and page.
+    """Write the results of an identification into a folder: tables, summary, figures and page.
 
     Arguments: `data` and `model` name the files; `axis` is the amplitude of the figures of
     backbone and damping, of which the tables then have a column. Returns the page's report.
@@ -236,7 +236,7 @@ def write(
 
 
 def _further_load(prediction: Prediction) -> dict[str, float | str]:
-    """What a summary says of a predicted force beside its newtons."""
+    """Entries of a summary on a predicted force, in addition to its newtons."""
     given = {"drive_v": prediction.drive, "force_at": prediction.at}
     return {name: value for name, value in given.items() if value is not None}
 

@@ -1,4 +1,4 @@
-"""What an import gave: measured.csv or records, map.toml, and its lines."""
+"""Results of an import: measured.csv or records, map.toml, and the printed lines."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ def write(folder: Path, found: Imported, *, files: Sequence[str] = ()) -> list[s
 
 
 def headline(found: Imported) -> list[str]:
-    """What was assumed, and how many states."""
+    """Assumptions, and the number of states."""
     lines = [f"assumed {key}: {why}" for key, why in found.assumed.items()]
     if found.states is not None:
         data = found.states
@@ -32,8 +32,8 @@ def headline(found: Imported) -> list[str]:
         )
         if data.base is not None:
             lines.append(
-                "a base moves the structure, and velocities are as recorded: `--base absolute` of "
-                "modes and test (or relative), or [base] in a model, says whether the base's "
-                "motion is in them"
+                "the base moves, and velocities are as recorded: state whether they include the "
+                "base motion by `--base absolute` (or relative) of modes and test, or by [base] in "
+                "a model"
             )
     return lines

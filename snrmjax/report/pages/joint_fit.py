@@ -1,4 +1,4 @@
-"""What a report tells of a joint fit: its parameters, errors and residuals, and its advice."""
+"""Report of a joint fit: its parameters, errors and residuals, and its advice."""
 
 from collections.abc import Mapping, Sequence
 
@@ -30,30 +30,30 @@ from snrmjax.report.sampling import VELOCITY, ShownAmplitude
 from snrmjax.report.sentences.identify import in_words
 from snrmjax.report.style import PrintedFigure, unit_for
 
-_LISTED = 12  # contributions by name; the rest stands in one row
+_LISTED = 12  # contributions by name; the rest is summed in one row
 
 CURVES_CAPTION = (
     "The joint fit. Lines are the curves fitted to all states at once; the darker band contains "
     "the true curve with a probability of 95 %. Where levels differ from one another, the paler "
-    "band contains the curve of one further level. Dots are what single states give on their own, "
-    "with the errors that their level shares: dots beside the line on a vertical streak are such "
-    "errors, a line beside all dots is not."
+    "band contains the curve of one further level. Dots are the results of single states, with "
+    "the errors common to their level: dots off the line in a vertical streak are such errors, a "
+    "line off all dots is not."
 )
 RESIDUALS_CAPTION = (
-    "Misfit of each point in standard deviations: what the fit leaves of the force balance in "
-    "phase with the force (at resonance that of the damping) and in quadrature with it (at "
-    "resonance that of the stiffness). Where curves and noise are right the dots are a cloud "
-    "without shape, and one in twenty lies outside the dashed lines. A bend means that "
-    "the curves, the phase or the linear modes are wrong; a funnel, that the noise is."
+    "Residual of each point in standard deviations: the residual of the force balance in phase "
+    "with the force (damping, at resonance) and in quadrature with it (stiffness, at resonance). "
+    "Where curves and noise are right the dots are a structureless cloud, with one in twenty "
+    "outside the dashed lines. A trend means that the curves, the phase or the linear modes are "
+    "wrong; a funnel, that the noise is."
 )
 FRACTIONS_CAPTION = (
-    "Where the width of the bands comes from: shares of the variance, mean over the measured "
-    "amplitudes. Bars of one colour sum to 100 %. Random errors shrink with more states, errors "
-    "of levels only with more levels."
+    "Contributions to the width of the bands: fractions of the variance, averaged over the "
+    "measured amplitudes. Bars of one colour sum to 100 %. Random errors decrease with more "
+    "states, level errors only with more levels."
 )
 ADVICE_CAPTION = (
-    "Where to measure next: the states of the table, numbered in its order, on the responses that "
-    "the fit predicts. Dashed parts are unstable."
+    "Where to measure next: the states of the table, numbered in its order, on the responses "
+    "predicted by the fit. Dashed parts are unstable."
 )
 
 
@@ -82,13 +82,13 @@ def joint_figures(
 def joint_sections(
     details: FitDetails, figures: Mapping[str, Figure | PrintedFigure]
 ) -> list[Section]:
-    """The sections of a report that tell a joint fit, with its figures."""
+    """The sections of a report on a joint fit, with its figures."""
     fit = details.fit
     summary = summarise_fit(fit, ())
     intro = (
         f"Both curves were fitted together to {len(fit.data.level)} states of "
-        f"{fit.data.n_levels} levels: {curves_in_words(fit)}. Errors that the states of a level "
-        "share are unknowns of the fit."
+        f"{fit.data.n_levels} levels: {curves_in_words(fit)}. Errors common to the states of a "
+        "level are unknowns of the fit."
     )
     shown = [
         ReportFigure(figures["joint_fit"], CURVES_CAPTION),
@@ -99,7 +99,7 @@ def joint_sections(
     sections = [
         Section("Joint fit", [intro], shown, tables),
         Section(
-            "What the bands are made of",
+            "Contributions to the bands",
             (),
             [ReportFigure(figures["contributions"], FRACTIONS_CAPTION)],
             [contribution_table(details.fractions)],
@@ -119,7 +119,7 @@ def curves_in_words(fit: JointFit) -> str:
 
 
 def words_of_fit(fit: JointFit) -> CurveWords:
-    """What a report says of the curves of a joint fit."""
+    """Texts of a report on the curves of a joint fit."""
     noise = fit.noise
     squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
     fitted = "force_gain" in fit.free
@@ -127,9 +127,9 @@ def words_of_fit(fit: JointFit) -> CurveWords:
     return CurveWords(
         line="The line is the joint fit to all steady states, not a curve drawn through the "
         "stars; the band is its 95 % range.",
-        bands="Error bars and bands are 95 %. The bands of the joint fit hold the noise, stated or "
-        f"estimated, and what the points of one level share{gain}",
-        noise=f"{noise_in_words(noise, 'velocity')}, errors of whole levels apart",
+        bands="Error bars and bands are 95 %. The bands of the joint fit include the noise, stated "
+        f"or estimated, and errors common to the points of one level{gain}",
+        noise=f"{noise_in_words(noise, 'velocity')}, errors of whole levels excluded",
         scatter=f"{in_words(noise.level_std)} (1σ)" if np.any(noise.level_std > 0) else NO_SCATTER,
         argument=f"natural frequency: {squared.argument} amplitude; damping: {damping.argument} "
         "amplitude",
@@ -137,7 +137,7 @@ def words_of_fit(fit: JointFit) -> CurveWords:
 
 
 def parameter_table(summary: dict, gain_unit: str = "") -> ReportTable:
-    """Parameters as `summarise_fit` has them, ± 1σ, and what they read as in other units.
+    """Parameters as `summarise_fit` has them, ± 1σ, and converted to other units.
 
     Arguments: `gain_unit` of the force gain: N/V where only the drive voltage is known.
     """
@@ -145,7 +145,7 @@ def parameter_table(summary: dict, gain_unit: str = "") -> ReportTable:
     for name, one in summary["parameters"].items():
         value, std = one["value"], one["std"]
         row = (name, minus(with_error(value, std)), _unit(one["unit"]))
-        rows.append((*row, minus(_reads_as(name, value, std))))
+        rows.append((*row, minus(_converted(name, value, std))))
         if name == "force_gain":
             # The fit's own unknown is the gain's logarithm.
             rows[-1] = (name, f"{np.exp(value):.4g} ± {100 * std:.2g} %", gain_unit, "")
@@ -162,7 +162,7 @@ def _unit(name: str) -> str:
     )
 
 
-def _reads_as(name: str, value: float, std: float) -> str:
+def _converted(name: str, value: float, std: float) -> str:
     """Values of a backbone as frequencies, a phase in degrees."""
     if name.startswith(("backbone.at_zero", "backbone.knot_")) and value > 0:
         omega = float(np.sqrt(value))
@@ -173,7 +173,7 @@ def _reads_as(name: str, value: float, std: float) -> str:
 
 
 def error_table(summary: dict) -> ReportTable:
-    """The noise, and what levels have in common, as the fit takes them."""
+    """Noise and level errors as the fit uses them."""
     noise, levels = summary["noise"], summary["levels"]
     scale, std = noise["scale"], noise["scale_std"]
     of_noise = (
@@ -193,7 +193,7 @@ def error_table(summary: dict) -> ReportTable:
         ),
         ("damping, from level to level", f"{100 * levels['damping_std_relative']:.2g} %"),
     ]
-    return ReportTable(("error", "1σ"), rows, "Errors as the fit takes them, stated or found.")
+    return ReportTable(("error", "1σ"), rows, "Errors as used by the fit, stated or estimated.")
 
 
 def contribution_table(fractions: Sequence[Contribution]) -> ReportTable:
@@ -205,31 +205,31 @@ def contribution_table(fractions: Sequence[Contribution]) -> ReportTable:
         pairs.append((f"{len(others)} further ones together", *rest))
     rows = [(name, f"{100 * a:.1f}", f"{100 * b:.1f}") for name, a, b in pairs]
     header = ("source of error", "natural frequency (%)", "damping (%)")
-    caption = "Shares of the variance of both bands, largest first."
+    caption = "Fractions of the variance of both bands, largest first."
     return ReportTable(header, rows, caption, "Every source of error by name")
 
 
 def advice_table(advice: Sequence[NextMeasurement]) -> ReportTable:
     """Advised states by rank, with the reason of each."""
     drives = [one.drive for one in advice if one.drive is not None]
-    # Where only the drive is known, nobody can set a force in newtons.
+    # Where only the drive is known, a force in newtons cannot be set.
     loads, what = (drives, "drive") if drives else ([one.force for one in advice], "force")
     load = unit_for(loads, "V" if drives else "N")
     unit = unit_for([one.velocity for one in advice], "m/s")
     rows = [
         (
-            *(f"{one.rank}", f"{size / load.size:.4g}", f"{one.frequency / HERTZ:.6g}"),
+            *(f"{one.rank}", f"{value / load.size:.4g}", f"{one.frequency / HERTZ:.6g}"),
             *(f"{one.velocity / unit.size:.3g}", minus(f"{round(one.phase / DEGREE):d}")),
             *(f"{100 * one.expected_band_ratio:.1f}", str(one.reason)),
         )
-        for one, size in zip(advice, loads, strict=True)
+        for one, value in zip(advice, loads, strict=True)
     ]
     header = (
         *("rank", f"{what} ({load.name})", "frequency (Hz)", f"velocity ({unit.name})"),
         *("phase (°)", "bands left (%)", "reason"),
     )
     caption = (
-        "Each state given the ones before it. Velocity and phase are those to be expected; bands "
-        "left: the mean width of the bands after this measurement, of today's."
+        "Each state assumes the ones before it. Velocity and phase are predictions; bands left: "
+        "the mean width of the bands after this measurement, relative to the present one."
     )
     return ReportTable(header, rows, caption)

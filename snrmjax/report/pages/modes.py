@@ -1,4 +1,4 @@
-"""Linear modes on file: the model, a table of modes, a report."""
+"""Files of linear modes: the model, a table of modes, a report."""
 
 from pathlib import Path
 
@@ -29,12 +29,12 @@ from snrmjax.report.html import (
 
 _BAND = 1.96  # standard deviations of a 95 % band
 _ORDERS = (
-    "Poles of every model order. A pole that stays where it is over many orders (blue) is "
-    "physical; others come and go with the order. Vertical lines are the modes that were taken."
+    "Poles of every model order. A pole that persists over many orders (blue) is "
+    "physical; others come and go with the order. Vertical lines are the selected modes."
 )
 _RESPONSES = (
-    "Receptance as measured, and as the modes with their residual terms give it. Where a peak "
-    "stands in the measured line alone, a mode was missed."
+    "Receptance as measured, and synthesised from the modes with their residual terms. A peak in "
+    "the measured curve only is a missed mode."
 )
 _DECAY = "The recorded decay and the sum of decaying oscillations that was fitted to it."
 
@@ -93,7 +93,7 @@ def modal_report(of: LinearModesFound) -> Report:
 _WEIGHTS = {
     "stated": "stated errors",
     "coherence": "coherence",
-    "residuals": "errors found from the residuals",
+    "residuals": "errors estimated from the residuals",
 }
 
 
@@ -155,7 +155,7 @@ def _table(modes: ScaledModes, found: LinearModalFit | DecayModes) -> ReportTabl
         *("mode", "frequency (Hz)", "damping (%)", f"participation per {modes.per}"),
         *("modal mass", "phase collinearity", "lines in the half-power band"),
     )
-    return ReportTable(header, rows, "Bands are of 95 %.")
+    return ReportTable(header, rows, "Bands are 95 %.")
 
 
 def _shapes(modes: ScaledModes) -> ReportTable:
@@ -171,7 +171,7 @@ def _shapes(modes: ScaledModes) -> ReportTable:
         for s, name in enumerate(modes.sensors)
     ]
     header = ("sensor", *(f"mode {k + 1} ({unit})" for k in range(modes.n_modes)))
-    return ReportTable(header, rows, "Shapes at the sensors, with bands of 95 %.")
+    return ReportTable(header, rows, "Shapes at the sensors, with 95 % bands.")
 
 
 def _columns(modes: ScaledModes) -> dict[str, np.ndarray]:

@@ -35,23 +35,23 @@ from snrmjax.report.html import (
 )
 from snrmjax.report.style import printed, with_unit
 
-SHAPES = "Shapes of the modes that the reduced model keeps."
+SHAPES = "Shapes of the modes kept in the reduced model."
 STATIC = (
-    "Static load along one mode, given as the displacement that it would cause in the linear "
-    "structure, against the displacement at the place where that mode is largest, of the mode "
-    "alone. Dots: finite elements; filled ones are load cases of the fit, hollow ones larger loads "
-    "that the fit has not seen: they show how far the model holds. Lines: the reduced model with "
-    "all its modes, from rest; a line ends where its path turns unstable."
+    "Static load along one mode, expressed as the displacement it would cause in the linear "
+    "structure, against the displacement of that mode where its shape is largest. "
+    "Dots: finite elements; filled ones are load cases of the fit, hollow ones larger loads not "
+    "used in the fit: they show how far the model is valid. Lines: the reduced model with all its "
+    "modes, from rest; a line ends where the path becomes unstable."
 )
 QUALITY = (
-    "Each load case is left out of the fit and predicted by the others. Errors that grow with the "
-    "nonlinear force are terms that the polynomial lacks; errors that grow as it falls are "
+    "Each load case is left out of the fit and predicted from the others. Errors that grow with "
+    "the nonlinear force are missing terms of the polynomial; errors that grow as it falls are "
     "round-off."
 )
 SCALE = (
-    "The condensation repeated with loads of many sizes. Left: how far the leading coefficients "
-    "are from those of the model. Small loads show the round-off of displacements, large ones the "
-    "terms that the polynomial lacks; between them the coefficients do not depend on the loads, "
+    "The condensation repeated at many load scales. Left: deviation of the leading coefficients "
+    "from those of the model. Small loads show the round-off of displacements, large ones the "
+    "missing terms of the polynomial; between them the coefficients do not depend on the loads, "
     "and the model's own load scale should lie there. The plateau is where they stay within "
     f"{100 * TOLERANCE:g} %."
 )
@@ -85,7 +85,7 @@ def headline(reduction: Reduction) -> list[str]:
     lines = []
     if reduction.load_scale is not None:
         scale = f"{reduction.load_scale:.3g} thicknesses"
-        lines.append(f"loads move single modes linearly by up to {scale}")
+        lines.append(f"loads displace single modes linearly by up to {scale}")
     if reduction.study is not None:
         lines.append("; ".join(reduction.study.summary()[1:]))
     return [*lines, reduction_sentence(reduction)]
@@ -107,7 +107,7 @@ def reduction_sentence(reduction: Reduction) -> str:
 
 
 def reduction_summary(reduction: Reduction) -> dict:
-    """What summary.json has."""
+    """The content of summary.json."""
     found, study = reduction.condensation, reduction.study
     quality, potential = found.quality, found.potential
     keys = [monomial_key(m) for m in potential.monomials]
@@ -185,12 +185,12 @@ def _done(reduction: Reduction) -> list[tuple[str, str]]:
     done = [("modes", numbers), ("force of degree", str(found.degree))]
     if reduction.displacement is not None:
         low, high = (with_unit(f(reduction.displacement), "m", 3) for f in (np.min, np.max))
-        size = low if low == high else f"{low} to {high}"
+        span = low if low == high else f"{low} to {high}"
         if reduction.load_scale is not None:
-            size += f" (up to {reduction.load_scale:.3g} thicknesses)"
+            span += f" (up to {reduction.load_scale:.3g} thicknesses)"
         stated = reduction.source.load_scale is not None
         why = "as stated" if stated else f"nonlinear force {NONLINEAR_RATIO:g} of the linear"
-        done.append(("loads move single modes linearly by", f"{size}: {why}"))
+        done.append(("loads displace single modes linearly by", f"{span}: {why}"))
     return done
 
 
@@ -222,16 +222,16 @@ def _fit(folder: Path, reduction: Reduction) -> Section:
     table = ReportTable(
         ("equation", "residual", "cross-validated", "linear stiffness / ω²"),
         rows,
-        "Residuals of each modal equation over the rms force on that mode, and the linear "
-        f"stiffness that the load cases show. Condition of the fit: {quality.condition:.2g}.",
+        "Residuals of each modal equation relative to the rms force on that mode, and the linear "
+        f"stiffness fitted to the load cases. Condition of the fit: {quality.condition:.2g}.",
     )
     figure = _saved(folder, "fit_quality", quality_figure(reduction.condensation), QUALITY)
     text = []
     if quality.energy_error is not None:
         worst = float(np.nanmax(np.abs(quality.energy_error)))
         text.append(
-            "The strain energy of the reduced model, which no fit has used, is at most "
-            f"{number(100 * worst, 2)} % off the finite elements'."
+            "The strain energy of the reduced model, which was not used in the fit, differs from "
+            f"that of the finite elements by at most {number(100 * worst, 2)} %."
         )
     return Section("Fit", text, [figure], [table])
 

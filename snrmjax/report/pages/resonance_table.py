@@ -1,4 +1,4 @@
-"""Phase resonances of a test's levels, measured and predicted, as a report tells them."""
+"""Table of the phase resonances of a test's levels, measured and predicted."""
 
 from collections.abc import Iterable, Sequence
 
@@ -12,12 +12,12 @@ def resonance_rows(rows: Sequence[LevelResponse], force_unit: str = "N") -> list
     """The rows of the table of resonances, all velocities in one unit."""
     each = [(row.measured, row.before, row.completed, row.after) for row in rows]
     unit = velocity_unit(one for four in each for one in four)
-    some_unseen = any(row.held_out for row in rows)
+    some_withheld = any(row.held_out for row in rows)
     table = []
-    for row, (*seen, unseen) in zip(rows, each, strict=True):
-        texts = [resonance_in_words(one, unit) for one in seen]
-        if some_unseen:
-            texts.append(resonance_in_words(unseen, unit) if row.held_out else "–")
+    for row, (*fitted, withheld) in zip(rows, each, strict=True):
+        texts = [resonance_in_words(one, unit) for one in fitted]
+        if some_withheld:
+            texts.append(resonance_in_words(withheld, unit) if row.held_out else "–")
         table.append((str(row.level), _unbroken(with_unit(row.force, force_unit)), *texts))
     return table
 
@@ -32,7 +32,7 @@ def resonance_in_words(one: PhaseResonance, unit: Unit) -> str:
     """Frequency, velocity and fold of a phase resonance, or why there is none."""
     if one.jump is not None:
         low, high = (f"{end:.5g}" for end in one.jump)
-        return f"none: the states jump past it, {_unbroken(f'{low} → {high} Hz')}"
+        return f"none: the states jump over it, {_unbroken(f'{low} → {high} Hz')}"
     if not np.isfinite(one.frequency):
         return "no resonance"
     fold = f", fold at {_unbroken(f'{one.fold:.5g} Hz')}" if np.isfinite(one.fold) else ""
@@ -41,5 +41,5 @@ def resonance_in_words(one: PhaseResonance, unit: Unit) -> str:
 
 
 def _unbroken(text: str) -> str:
-    """A value that keeps its unit in its line."""
+    """A value and its unit, joined by a no-break space."""
     return text.replace(" ", "\u00a0")

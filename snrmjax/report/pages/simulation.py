@@ -19,16 +19,16 @@ from snrmjax.report.sentences import number_of, sentences
 from snrmjax.report.style import save_figure, save_figures
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, velocity_at_sensors
 
-# Events that the terminal counts, beside the largest velocity.
+# Events counted in the printed lines, in addition to the largest velocity.
 _COUNTED = {
     "fold": "fold",
     "period_doubling": "period doubling",
     "neimark_sacker": "Neimark-Sacker point",
 }
 _CAPTIONS = {
-    "response": "Velocity over the frequency of the force; dashed where the response is unstable.",
-    "events": "Events of the responses over the parameter.",
-    "quasi_periodic": "Motions with two frequencies beside the responses that they leave.",
+    "response": "Velocity against excitation frequency; dashed where the response is unstable.",
+    "events": "Events of the responses against the parameter.",
+    "quasi_periodic": "Quasi-periodic motions and the responses from which they branch.",
 }
 
 
@@ -71,8 +71,8 @@ def headline(found: SimulatedResponses | SimulatedMode) -> list[str]:
     if isinstance(found, SimulatedMode):
         branch = found.branch
         speed = np.abs(branch.velocity[-1, 1, branch.sensors.index(found.sensor)])
-        place = f"{branch.frequency[-1] / HERTZ:.5g} Hz, {speed:.3g} m/s at {found.sensor}"
-        return [f"the mode ends at {place}"]
+        end = f"{branch.frequency[-1] / HERTZ:.5g} Hz, {speed:.3g} m/s at {found.sensor}"
+        return [f"the mode ends at {end}"]
     events = ["; ".join(curve.summary()) for curve in found.events]
     tori = ["; ".join(branch.summary()) for branch in found.quasi_periodic]
     return [*(_largest(curve, found.sensor) for curve in found.curves), *events, *tori]
@@ -90,8 +90,8 @@ def _largest(curve: ResponseCurve, sensor: str) -> str:
     top = int(np.argmax(speed))
     # A fold is always counted, the others where there are any.
     counts = {name: len(curve.at_events(kind)) for kind, name in _COUNTED.items()}
-    turns = ", ".join(number_of(n, name) for name, n in counts.items() if n or name == "fold")
+    events = ", ".join(number_of(n, name) for name, n in counts.items() if n or name == "fold")
     return (
         f"{load}: fundamental velocity at {sensor} up to {speed[top]:.4g} m/s, at "
-        f"{curve.frequency[top] / HERTZ:.5g} Hz; {turns}"
+        f"{curve.frequency[top] / HERTZ:.5g} Hz; {events}"
     )

@@ -1,4 +1,4 @@
-"""The page of a whole test: files, check, all states to look at, and what each stage found."""
+"""The page of a whole test: files, check, all states, and the results of each stage."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from snrmjax.report.html import PROGRAM, Report, ReportTable, Section, write_rep
 from snrmjax.report.pages import diagnosis, identified_test, modes
 from snrmjax.report.pages.identification import linear_mode_row
 
-_TAPPED = "A state that is tapped shows its record, where there is one."
+_TAPPED = "Tap a state to see its record, where there is one."
 
 
 class _Stage(NamedTuple):
@@ -24,7 +24,7 @@ class _Stage(NamedTuple):
 
 def write(folder: Path, found: WholeTest) -> Report:
     """Write report.html, measured.csv, check.json, model.toml and modes.csv where the linear modes
-    were found here, and the files of `identify` and `diagnose` in folders of these names.
+    were identified here, and the files of `identify` and `diagnose` in folders of these names.
     """
     write_steady_states(folder / "measured.csv", found.data)
     write_checkup(folder / "check.json", found.checkup)
@@ -97,7 +97,7 @@ def _report(found: WholeTest, stages: list[_Stage], result: str) -> Report:
             for section in report.sections
         ]
     notes = {str(note): "" for note in found.notes}
-    for name, report in stages:  # each note once, of the stage that said it first
+    for name, report in stages:  # each note once, from the first stage that has it
         for note in report.notes:
             notes.setdefault(note, f"{name}: ")
     return Report(
@@ -112,21 +112,21 @@ def _report(found: WholeTest, stages: list[_Stage], result: str) -> Report:
 
 def _result(found: WholeTest, identified: Report, diagnosed: Report | None) -> str:
     """Check, backbone and diagnosis in a sentence each; their numbers are in the summary."""
-    said = [f"{_check(found.checkup).capitalize()}."]
-    said.append(identified.result)
+    sentences = [f"{_check(found.checkup).capitalize()}."]
+    sentences.append(identified.result)
     if found.counts is not None and found.counts.reasons:
-        said.append(f"{found.counts.fact}.")
-    said += [] if diagnosed is None else [diagnosed.result]
+        sentences.append(f"{found.counts.fact}.")
+    sentences += [] if diagnosed is None else [diagnosed.result]
     if found.left_out:
-        said.append("The diagnosis was left out: the first note says why.")
-    return " ".join(text for text in said if text)
+        sentences.append("The diagnosis was skipped: the first note gives the reason.")
+    return " ".join(text for text in sentences if text)
 
 
 def _files(found: WholeTest) -> Section:
     tables = [
-        ReportTable(("file", "what was found in it"), list(found.files.rows())),
+        ReportTable(("file", "content"), list(found.files.rows())),
         *(
-            ReportTable((file,), [(line,) for line in lines], f"{file}, as it lies here.")
+            ReportTable((file,), [(line,) for line in lines], f"{file}, as in the folder.")
             for file, lines in found.files.texts
         ),
     ]
@@ -135,7 +135,7 @@ def _files(found: WholeTest) -> Section:
 
 
 def _check_section(checkup: Checkup) -> Section:
-    header = ("severity", "what", "where", "evidence", "what mends it")
+    header = ("severity", "finding", "where", "evidence", "remedy")
     rows = [
         (finding.severity, finding.name, finding.where, str(finding.evidence), str(finding.advice))
         for finding in checkup.findings

@@ -1,8 +1,8 @@
-"""Every sentence that a fact becomes, a file a subject, each a table `SENTENCES` by kind.
+"""The wording of every fact: one file per subject, each with a table `SENTENCES` keyed by kind.
 
-An entry is a template with the fact's values by name, or a function of them. Beside Python's own
-formats, templates know `{n:#state}` (1 state, 2 states), `{fraction:%.3g}` (of 0.05: 5 %) and lists
-("1, 2 and 5").
+An entry is a format string with the fact's values by name, or a function of them. In addition to
+Python's own formats there are `{n:#state}` (1 state, 2 states), `{fraction:%.3g}` (0.05 is 5 %) and
+lists ("1, 2 and 5").
 """
 
 import importlib
@@ -18,7 +18,7 @@ Wording = str | Callable[..., str]
 
 
 class _Words(string.Formatter):
-    """Python's formats, numbers with a noun, shares in per cent, and lists."""
+    """Python's formats, counts with a noun, fractions in per cent, and lists."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         """See `string.Formatter`."""
@@ -35,7 +35,7 @@ _WORDS = _Words()
 
 
 def sentence(fact: Fact) -> str:
-    """The sentence that tells a fact.
+    """A fact as a sentence.
 
     >>> sentence(Fact("record_left_out", why="it is clipped"))
     'a record was left out: it is clipped'
@@ -51,7 +51,7 @@ def sentences(facts: Sequence[Fact]) -> list[str]:
 
 @cache
 def wordings() -> dict[str, Wording]:
-    """The wording of every kind of fact; no kind stands in two subjects."""
+    """The wording of every kind of fact; each kind belongs to one subject."""
     every: dict[str, Wording] = {}
     for subject in pkgutil.iter_modules(__path__):
         table = importlib.import_module(f"{__name__}.{subject.name}").SENTENCES

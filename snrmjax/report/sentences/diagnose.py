@@ -1,4 +1,4 @@
-"""What a diagnosis has to tell: verdict, reasons, notes, drawn laws."""
+"""Sentences of a diagnosis: verdict, reasons, notes, drawn laws."""
 
 from collections.abc import Sequence
 
@@ -16,12 +16,12 @@ _LAWS = {
         *("damping that depends on the displacement", "more damping", "less damping"),
         "m",
     ),
-    "slip": ("friction with a memory", "gaining stiffness", "losing stiffness", "m"),
+    "slip": ("hysteretic friction", "gaining stiffness", "losing stiffness", "m"),
 }
 _COMPLETED = {
     "completed": "",
     "nothing_added": "nothing was added to the model",
-    "not_physical": ", but no structure can have these parameters: there is no completed model",
+    "not_physical": ", but the parameters are not physical: there is no completed model",
 }
 _UNITS = {"velocity": "m/s", "displacement": "m"}
 
@@ -72,35 +72,39 @@ def _verdict(
     misfit_before: float,
     misfit: float,
 ) -> str:
-    found = effect_names([group[0] for group in classes])
+    effects = effect_names([group[0] for group in classes])
     falls = f"the misfit falls from {_times(misfit_before)} to {_times(misfit)} times the noise"
     with_it = "with them" if len(classes) > 1 else "with it"
     match verdict:
         case "none":
             return (
-                "Nothing is missing that these data could show: the model as given fits them to "
+                "No missing effect is detected in these data: the model as given fits them to "
                 f"{_times(misfit)} times the noise."
             )
         case "noise_rejected":
             return (
-                "The stated noise does not fit the scatter of these data, so no effect is named: "
-                "state the noise of a repeated test, or none, and diagnose again."
+                "The stated noise is inconsistent with the scatter of these data, so no effect is "
+                "named: state the noise of a repeated test, or none, and diagnose again."
             )
         case "unknown":
-            start = "Something is missing that no effect of the library explains reliably"
-            return f"{start}; the best attempt is {found}: {falls}." if found else f"{start}."
+            start = "The model lacks something that no effect in the library explains reliably"
+            return f"{start}; the best attempt is {effects}: {falls}." if effects else f"{start}."
         case "drawn":
             return (
-                "The model lacks a force that no effect of the library explains, drawn from the "
-                f"data: {'; beside it '.join(laws)}. With it {falls}."
+                "The model lacks a force that no effect in the library explains, drawn from the "
+                f"data: {'; in addition '.join(laws)}. With it {falls}."
             )
         case "named":
-            return f"The model lacks {found}: {with_it} {falls}, and nothing else explains as much."
+            return (
+                f"The model lacks {effects}: {with_it} {falls}, and nothing else explains as much."
+            )
     if any(len(group) > 1 for group in classes):
         rivals = " and ".join(effect_names(group, "or") for group in classes)
-        return f"The model lacks {rivals}, and these data cannot tell which: {with_it} {falls}."
+        return (
+            f"The model lacks {rivals}, and these data cannot distinguish them: {with_it} {falls}."
+        )
     return (
-        f"The model probably lacks {found}: {with_it} {falls}, but something else could have the "
+        f"The model probably lacks {effects}: {with_it} {falls}, but something else could have the "
         "same effect (see the notes)."
     )
 
@@ -116,31 +120,34 @@ def _part_of_change(
 ) -> str:
     laws = " and ".join(effect_names(group, "or") for group in classes)
     if part == "instrument":
-        return f"The records show {laws}."
+        return f"Instrument error: {laws}."
     what = f"the change of {part} with amplitude"
     if part.startswith("harmonic"):
         what = part.replace("_", " ")
     if not classes or explained is None:
-        return f"No law of the library explains {what}: it is drawn."
+        return f"No law in the library explains {what}: it is drawn as a curve."
     value, low, high = (f"{100 * number:.0f}" for number in explained)
     band = f"{value} %" if low == high else f"{value} % ({low} to {high})"
     if explained[0] < 0.5:
         return (
-            f"No law of the library explains most of {what}: it is drawn. Nearest: {laws}, {band}."
+            f"No law in the library explains most of {what}: it is drawn as a curve. Closest: "
+            f"{laws}, {band}."
         )
     several = any(len(group) > 1 for group in classes)
     verb = "explain" if len(classes) > 1 else "explains"
     text = f"{laws[0].upper()}{laws[1:]} {verb} {band} of {what}"
     if several:
-        text += "; these data cannot tell which"
+        text += "; these data cannot distinguish them"
     elif probability < 0.99:
         text += f", with a probability of {probability_in_words(probability)}"
-    return f"{text}. What is left is more than noise: it is drawn." if left else f"{text}."
+    return (
+        f"{text}. The remainder exceeds the noise: it is drawn as a curve." if left else f"{text}."
+    )
 
 
 def _most_probable(*, verdict: float, answers: Sequence[tuple[Sequence[str], float]]) -> str:
     listed = ", ".join(f"{kinds_in_words(one)} {probability_in_words(p)}" for one, p in answers)
-    return f"{probability_in_words(verdict)} of this verdict ({listed})"
+    return f"{probability_in_words(verdict)} for this verdict ({listed})"
 
 
 def _before(
@@ -156,7 +163,7 @@ def _before(
     ]
     named = effect_names(effects) or "no effect"
     return (
-        f"before the further states the verdict was {verdict} ({named}). Probabilities: "
+        f"before the additional states the verdict was {verdict} ({named}). Probabilities: "
         f"{', '.join(changes)}."
     )
 
@@ -164,19 +171,19 @@ def _before(
 def _level_errors(
     *, gain: float, phase: float, frequency: float, damping: float, of_data: bool
 ) -> str:
-    sizes = (
+    errors = (
         *((gain, 100.0, " % in gain"), (phase, 180 / np.pi, "° in phase")),
         *((frequency, 100.0, " % in frequency"), (damping, 100.0, " % in damping")),
     )
-    listed = ", ".join(f"{unit * size:.2g}{word}" for size, unit, word in sizes if size > 0)
+    listed = ", ".join(f"{unit * error:.2g}{word}" for error, unit, word in errors if error > 0)
     if of_data:
         return (
-            f"levels differ by {listed} (1σ), which nobody stated: taken for errors that the "
-            "states of a level share. State them in [measurement] if they are known."
+            f"levels differ by {listed} (1σ), for which no error is stated: treated as errors "
+            "common to all states of a level. State them in [measurement] if they are known."
         )
     return (
-        f"nobody stated by how much levels may be off: {listed} (1σ) are allowed for. State them "
-        "in [measurement] if they are known."
+        f"no level-to-level errors are stated: {listed} (1σ) are assumed. State them in "
+        "[measurement] if they are known."
     )
 
 
@@ -185,9 +192,9 @@ def _law_class(*, law: str, symmetries: Sequence[str], onsets: Sequence) -> str:
     words = " and ".join(symmetries)
     text = f"{words} {name}".strip()
     for onset in onsets:
-        size, prefix = next((one for one in _PREFIXES if onset.at >= one[0]), _PREFIXES[-1])
+        scale, prefix = next((one for one in _PREFIXES if onset.at >= one[0]), _PREFIXES[-1])
         side = {1: " for positive values", -1: " for negative values", 0: ""}[onset.side]
-        text += f", {more if onset.adds else less} from {onset.at / size:.2g} {prefix}{unit}{side}"
+        text += f", {more if onset.adds else less} from {onset.at / scale:.2g} {prefix}{unit}{side}"
     return text
 
 
@@ -201,35 +208,35 @@ def _no_place_fits(
 ) -> str:
     law = f"{effect_name(kind)} at {place}" if kind else place
     return (
-        "a force at none of these places reproduces the measured response: the best, "
+        "no single force at these points reproduces the measured response: the best, "
         f"{law}, leaves a residual of {misfit:.2g} times the noise. The force acts elsewhere, at "
-        "several places or by another law, or the linear model is wrong."
+        "several points or with another law, or the linear model is wrong."
     )
 
 
 def _not_placed(
     place: str, probability: float, other: str, misfit: float, sensor: str | None
 ) -> str:
-    said = (
-        f"the sensors cannot tell where the missing force acts: {place} "
-        f"({probability_in_words(probability)}) and {other} come first"
+    ranking = (
+        f"the sensors do not determine where the missing force acts: {place} "
+        f"({probability_in_words(probability)}) and {other} are the most probable"
     )
-    return f"{said}." if sensor is None else f"{said}; a sensor at {sensor} would tell them apart."
+    return f"{ranking}." if sensor is None else f"{ranking}; a sensor at {sensor} would decide."
 
 
 SENTENCES: dict[str, Wording] = {
     "force_placed": _placed,
     "placed_law_explains": lambda kind: (
-        f"{effect_name(kind)} at one place explains all sensors to the noise, which effects on the "
-        "mode alone do not."
+        f"{effect_name(kind)} at one point explains all sensors within the noise, which effects on "
+        "the mode alone do not."
     ),
     "force_not_placed": _not_placed,
     "no_place_fits": _no_place_fits,
-    # The verdict and what a result says first.
+    # The verdict and the first lines of a result.
     "verdict": _verdict,
     "part_of_change": _part_of_change,
     "misfit_falls": lambda *, before, after: (
-        f"With that the misfit falls from {_times(before)} to {_times(after)} times the noise."
+        f"With this the misfit falls from {_times(before)} to {_times(after)} times the noise."
     ),
     "most_probable": _most_probable,
     "probability_of_verdict": "probability: {probability}",
@@ -250,68 +257,69 @@ SENTENCES: dict[str, Wording] = {
     "diagnosis_note": "note: {note}",
     # Reasons of a verdict.
     "noise_misstated": lambda *, ratio: (
-        f"the misfit is {ratio:.2g} times the stated noise, without a pattern: it is "
+        f"the misfit is {ratio:.2g} times the stated noise, without a pattern: the noise is "
         f"{'overstated' if ratio < 1 else 'understated'}."
     ),
-    "no_effect_explains": "no effect of the library explains what is left.",
+    "no_effect_explains": "no effect in the library explains the remaining misfit.",
     "other_sensors_missed": (
-        "the answer follows from the reference sensor; at the other sensors it leaves {misfit:.2g} "
-        "times the noise: the mode shape may change with amplitude, or the force acts elsewhere "
-        "(`--where`)."
+        "the answer rests on the reference sensor; at the other sensors its residual is "
+        "{misfit:.2g} times the noise: the mode shape may change with amplitude, or the force acts "
+        "elsewhere (`--where`)."
     ),
     # Notes on data and model.
     "answer_before": _before,
     "gain_of_drive": lambda *, gain, from_curves: (
-        f"the force is known as a drive voltage only: about {gain:.4g} N/V by "
+        f"the force is known only as a drive voltage: about {gain:.4g} N/V from "
         f"{'smooth curves of amplitude' if from_curves else 'the model as given'}. The gain is "
-        "fitted too: a 1 % error of the gain looks like 1 % of damping."
+        "fitted too: a 1 % error of the gain looks like a 1 % change of damping."
     ),
     "gain_with_effects": (
-        "with the effects found the gain becomes {gain:.3g} N/V (before: {before:.3g})."
+        "with the identified effects the gain is {gain:.3g} N/V (before: {before:.3g})."
     ),
     "noise_not_stated": lambda *, size: (
-        f"no noise is stated: what is left ({100 * size:.2g} % of velocity, "
-        f"{np.degrees(size):.2g}°) is taken for it, so a good fit proves nothing."
+        f"no noise is stated: it is estimated from the residuals ({100 * size:.2g} % of velocity, "
+        f"{np.degrees(size):.2g}°), so a good fit is no evidence for the model."
     ),
     "levels_not_stated": _level_errors,
     "no_level_left_out": lambda *, n_levels: (
-        f"{number_of(n_levels, 'level')} only: no level can be left out of the fit to test the "
+        f"only {number_of(n_levels, 'level')}: none can be left out of the fit to validate the "
         "answer."
     ),
     "phases_of_sensors_unknown": (
-        "the phases of some sensors are unknown: their amplitudes alone are compared."
+        "the phases of some sensors are unknown: only their amplitudes are compared."
     ),
     "phases_unknown": (
-        "the phases of {n_states} of {of_states} states are unknown: for these only the size of "
-        "the force is compared, one number in place of two, and the phases are those of smooth "
-        "curves with the recorded amplitudes. "
-        "This hardly separates stiffness from damping: at resonance an amplitude shows the damping "
-        "alone, off resonance hardly any of it."
+        "the phases of {n_states} of {of_states} states are unknown: for these only the "
+        "magnitude of the force is compared, one number instead of two, with the phases of smooth "
+        "curves at the recorded amplitudes. "
+        "This hardly separates stiffness from damping: at resonance the amplitude depends on the "
+        "damping alone, off resonance hardly on it."
     ),
     "sensor_phase_unseen": (
-        "an error of the sensor's phase cannot be detected: it is not among the candidates."
+        "a phase error of the sensor cannot be detected and is not among the candidates."
     ),
     "harmonics_without_phase": (
-        "of harmonics the sizes alone are compared: their signs, which separate cubic from van der "
-        "Pol damping, are lost."
+        "only the amplitudes of harmonics are compared: their signs, which distinguish cubic from "
+        "van der Pol damping, are lost."
     ),
     "no_state_there": lambda *, near, levels: (
         f"no state {'within' if near else 'beyond'} 30° of resonance at level "
-        f"{', '.join(map(str, levels))} (by the model): its {'damping' if near else 'stiffness'} "
-        "is hardly determined."
+        f"{', '.join(map(str, levels))} (according to the model): its "
+        f"{'damping' if near else 'stiffness'} is poorly determined."
     ),
     "stated_parameters_moved": lambda *, parameters: (
-        "the answer moves "
+        "the fit moves "
         + ", ".join(
-            f"`{name}` by {step:+.2g} times its 1σ of {std:.2g}" for name, step, std in parameters
+            f"`{name}` by {step:+.2g} times its stated 1σ of {std:.2g}"
+            for name, step, std in parameters
         )
-        + ", as the model states it: check the linear test, or whether it was of another assembly."
+        + ": check the linear test, and whether it was on the same assembly."
     ),
     "other_modal_mass": lambda *, value, std, model, stated_std, beyond: (
-        f"the data say that the modal mass is {value:.4g} ± {std:.2g} kg; the model has "
-        f"{model:.4g} kg (1σ stated: {100 * stated_std:.2g} %)"
-        f"{', which is farther than that: check the linear test' if beyond else ''}. A gain of the "
-        "force or of the sensor does the same, so that none of that size can be told from it: "
+        f"the data give a modal mass of {value:.4g} ± {std:.2g} kg; the model has "
+        f"{model:.4g} kg (stated 1σ: {100 * stated_std:.2g} %)"
+        f"{', a larger deviation than that: check the linear test' if beyond else ''}. A gain "
+        "error of force or sensor has the same effect and cannot be separated from it: "
         "calibrate both statically, or repeat a level with a known added mass."
     ),
     "frequency_off": lambda *, fraction: (
@@ -319,16 +327,15 @@ SENTENCES: dict[str, Wording] = {
         "measurements of another mode?"
     ),
     "not_physical": (
-        "there is no completed model: {reason} The parameters that fit best are none that a "
-        "structure can have."
+        "there is no completed model: {reason} The best-fit parameters are not physical."
     ),
     "not_physical_without": lambda *, levels: (
-        f"without {of_levels(levels)} the parameters are none that a structure can have."
+        f"without {of_levels(levels)} the best-fit parameters are not physical."
     ),
-    "answer_not_converged": "the fit of the answer itself had not converged when it ended.",
+    "answer_not_converged": "the fit of the answer itself stopped before it converged.",
     "effects_not_fitted": lambda *, effects: (
-        f"{', '.join(map(effect_name, effects))} could not be fitted: with no starting point does "
-        "the model have the measured motions."
+        f"{', '.join(map(effect_name, effects))} could not be fitted: no starting point "
+        "reproduces the measured motions."
     ),
     # Drawn laws.
     "law_class": _law_class,

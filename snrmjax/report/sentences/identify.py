@@ -1,4 +1,4 @@
-"""What identifications, joint fits, predictions and advice have to tell."""
+"""Sentences of identifications, joint fits, predictions and advice."""
 
 from collections.abc import Sequence
 
@@ -21,15 +21,15 @@ _UNITS = {
     "damping": (100, " % in damping"),
 }
 _COMMON = {
-    "gain": "all velocities share an error, or the force or the modal mass has one",
-    "phase": "the instruments turn all phases alike (free `instrument_phase`)",
-    "stiffness": "the natural frequency differs between this test and the others",
-    "damping": "the force or the modal mass has an error",
+    "gain": "a common error of velocities, force or modal mass",
+    "phase": "a common phase error of the instruments (free `instrument_phase`)",
+    "stiffness": "a natural frequency that differs between this test and the others",
+    "damping": "an error of force or modal mass",
 }
 _CORRECTIONS = {
     "velocities": ("scaled the velocities", 100, " %"),
     "forces": ("scaled the forces", 100, " %"),
-    "phases": ("turned the phases of the velocity", 180 / np.pi, "°"),
+    "phases": ("rotated the velocity phases", 180 / np.pi, "°"),
 }
 _REMEDIES = {
     "force_offset": "Add levels of smaller force, and states 30° to 70° from resonance",
@@ -43,16 +43,16 @@ def in_words(level_std: Sequence[float] | np.ndarray) -> str:
     return ", ".join(f"{factor * one:.2g}{name}" for (factor, name), one in pairs)
 
 
-def _of_kind(error: str, size: float) -> str:
+def _of_kind(error: str, value: float) -> str:
     factor, name = _UNITS[error]
-    return f"{factor * size:.2g}{name}"
+    return f"{factor * value:.2g}{name}"
 
 
 def _undetermined_gain(std: float, how: str) -> str:
     if how == Determination.HARDLY:
         return (
-            f"these data hardly determine the force gain: its 1σ is {100 * std:.2g} %, and so is "
-            "that of every damping; natural frequencies rest on the states near resonance. "
+            f"these data poorly determine the force gain: its 1σ is {100 * std:.2g} %, and so is "
+            "that of every damping value; natural frequencies rest on the states near resonance. "
             f"{_MEASURE_GAIN}."
         )
     wide = "any value fits them about equally well"
@@ -63,32 +63,36 @@ def _undetermined_gain(std: float, how: str) -> str:
 
 def _undetermined(name: str, std: float, how: str) -> str:
     is_phase = name == "instrument_phase"
-    size = f"{np.degrees(std):.2g}°" if is_phase else f"{100 * std:.2g} % of the smallest force"
-    verb = "hardly determine" if how == Determination.HARDLY else "cannot determine"
-    return f"these data {verb} `{name}` (1σ {size}). {_REMEDIES[name]}, or do not free it."
+    one_sigma = (
+        f"{np.degrees(std):.2g}°" if is_phase else f"{100 * std:.2g} % of the smallest force"
+    )
+    verb = "poorly determine" if how == Determination.HARDLY else "cannot determine"
+    return f"these data {verb} `{name}` (1σ {one_sigma}). {_REMEDIES[name]}, or do not free it."
 
 
 def _not_passive(what: str, free: Sequence[str]) -> str:
     if "force_gain" in free:
         return (
-            "the force gain cannot be determined from these data (the fit needs a negative "
+            "the force gain cannot be determined from these data (the fit gives a negative "
             f"{what}, which no passive structure has). {_MEASURE_GAIN}."
         )
     if free:
         return (
-            f"these data cannot determine `{free[0]}` (the fit needs a negative {what}, which no "
+            f"these data cannot determine `{free[0]}` (the fit gives a negative {what}, which no "
             f"passive structure has). {_REMEDIES[free[0]]}, or do not free it."
         )
     if what != "damping":
-        return f"no passive structure has these states: the fit needs a negative {what}."
+        return (
+            f"these states are not those of a passive structure: the fit gives a negative {what}."
+        )
     return (
-        "the damping comes out negative at every state: the model's `participation`, its shape at "
-        "the sensor, the sensor or the force has the wrong sign, or the phases are not those of a "
+        "the damping is negative at every state: the model's `participation`, its shape at the "
+        "sensor, the sensor or the force has the wrong sign, or the phases are not those of a "
         "velocity relative to the force."
     )
 
 
-def _wanders(std: float, noise_stated: bool) -> str:
+def _frequency_scatters(std: float, noise_stated: bool) -> str:
     more = "which the stated noise does not explain"
     if not noise_stated:
         more = "more than random noise of force and velocity explains"
@@ -107,29 +111,32 @@ def _levels_differ(std: Sequence[float], beyond_stated: bool) -> str:
 def _few_levels(n_levels: int, assumed: Sequence[float]) -> str:
     if n_levels > 1:
         return (
-            "2 levels only: the level-to-level variance rests on a single difference, and the "
+            "only 2 levels: the level-to-level variance rests on a single difference, and the "
             "bands may be too narrow."
         )
     if not any(assumed):
         return (
-            "1 level only: nothing shows whether its errors are as large as stated; the bands "
-            "include them as stated."
+            "only 1 level: its stated errors cannot be verified; the bands include them as stated."
         )
     return (
-        "1 level only: these data do not show by how much levels differ from one another. The "
-        f"bands include what is assumed instead, {in_words(assumed)} (1σ): measure further levels, "
-        "or state it in the model's [measurement]."
+        "only 1 level: these data do not show how much levels differ from one another. The bands "
+        f"include an assumed {in_words(assumed)} (1σ): measure further levels, or state it in the "
+        "model's [measurement]."
     )
 
 
 def _beyond_stated(
     error: str, stated: float, rms: float, largest: float, mean: float | None
 ) -> str:
-    common = "" if mean is None else f"; their mean is {mean:+.2g} of it: {_COMMON[error]}"
+    common = (
+        ""
+        if mean is None
+        else f"; their mean is {mean:+.2g} times it, which suggests {_COMMON[error]}"
+    )
     return (
-        f"levels deviate by {rms:.2g} times the stated 1σ of {_of_kind(error, stated)} (root mean "
-        f"square; largest {largest:.2g} times): the data ask for at least "
-        f"{_of_kind(error, rms * stated)}, or the bands are too narrow{common}."
+        f"levels deviate by {rms:.2g} times the stated 1σ of {_of_kind(error, stated)} (rms; "
+        f"largest {largest:.2g} times): the data need at least {_of_kind(error, rms * stated)}, or "
+        f"the bands are too narrow{common}."
     )
 
 
@@ -143,13 +150,13 @@ def _mass_moved(
 ) -> str:
     away, source = found_kg / model_kg - 1, "stated" if std_stated else "assumed"
     more = (
-        f"Damping ratios are relative to it: by the model's they are {100 * abs(away):.2g} % "
+        f"Damping ratios refer to it: with the model's they are {100 * abs(away):.2g} % "
         f"{'larger' if away > 0 else 'smaller'}."
     )
     if beyond_std:
         more = "Check the linear test, the force calibration and the mode shape at the sensor."
     return (
-        f"states away from resonance ask for a modal mass of {found_kg:.4g} ± {std_kg:.2g} kg, "
+        f"states away from resonance give a modal mass of {found_kg:.4g} ± {std_kg:.2g} kg, "
         f"{100 * away:+.2g} % from the model's {model_kg:.4g} kg ({source} 1σ "
         f"{100 * model_std:.2g} %). {more}"
     )
@@ -157,14 +164,14 @@ def _mass_moved(
 
 def _correlated(in_phase: float, quadrature: float, states_as_one: float) -> str:
     parts = {
-        "for the part in phase with the force": in_phase,
-        "for the part in quadrature with it": quadrature,
+        "in phase with the force": in_phase,
+        "in quadrature with it": quadrature,
     }
-    found = ", ".join(f"{value:.2g} {part}" for part, value in parts.items() if value > 0)
+    correlations = ", ".join(f"{value:.2g} {part}" for part, value in parts.items() if value > 0)
     return (
-        f"neighbouring points miss the curve in the same direction (correlation {found}): a "
-        "systematic error, not noise; the curves do not follow the data there, or the motion was "
-        f"not steady. About {states_as_one:.0f} points count as one in the bands."
+        f"residuals of neighbouring points are correlated ({correlations}): a systematic error, "
+        "not noise; the curves do not follow the data there, or the motion was not steady. About "
+        f"{states_as_one:.0f} points count as one in the bands."
     )
 
 
@@ -184,13 +191,13 @@ def _levels_corrected(of: str, levels: Sequence[int], change: Sequence[float], t
     more = ""
     if trend:
         verb = "grow" if trend > 0 else "fall"
-        more = f"; they {verb} with the force of the level, so they are probably not random"
+        more = f"; these corrections {verb} with the force and are probably not random"
     return f"the fit {done} of {which}, so that all levels lie on one pair of curves{more}."
 
 
 def _without_point(n_states: int, of: int, reason: str) -> str:
     return (
-        f"{n_states} of {of} steady states have no point of their own (the curves use them): "
+        f"{n_states} of {of} steady states give no point of their own (the curves use them): "
         f"{reason}."
     )
 
@@ -209,20 +216,20 @@ def _damping_and_phase(change: float, phase_was_free: bool) -> str:
             "near resonance"
         )
     return (
-        f"damping comes out {100 * abs(change):.0f} % higher from points {sides[0]} than from "
-        f"points {sides[1]}, which a damping that depends on amplitude alone does not do; an error "
-        f"of the instrument's phase does: {advice}."
+        f"damping is {100 * abs(change):.0f} % higher at points {sides[0]} than at points "
+        f"{sides[1]}, which is not an amplitude dependence but the signature of an instrument "
+        f"phase error: {advice}."
     )
 
 
 def _trend(error: str, change: float, there: float, p_value: float, load: object) -> str:
-    def sized(size: float) -> str:
-        return f"{'-' if size < 0 else '+'}{_of_kind(error, abs(size))}"
+    def signed(value: float) -> str:
+        return f"{'-' if value < 0 else '+'}{_of_kind(error, abs(value))}"
 
     return (
-        f"levels differ steadily with their force, by {sized(change)} from the smallest to the "
-        f"largest (p = {p_value:.1g}): a law that the curves lack, or a drive that is not linear. "
-        f"Its line has {sized(there)} at {load}: bands there are as much wider (1σ)."
+        f"level errors have a trend with the force, {signed(change)} from the smallest to the "
+        f"largest (p = {p_value:.1g}): the curves lack a term, or the drive is nonlinear. "
+        f"The trend is {signed(there)} at {load}: the bands there are wider by it (1σ)."
     )
 
 
@@ -241,7 +248,7 @@ def _resonance_range(
 ) -> str:
     (low, high), (slow, fast) = frequency_hz, velocity
     reach = f"within {ratio:g} times the largest measured amplitude"
-    beyond = "else it lies beyond (a larger `--extrapolate` looks farther)"
+    beyond = "else it lies beyond (a larger `--extrapolate` searches farther)"
     where = (
         f"with 95 % probability it lies between {low:.6g} and {high:.6g} Hz, its velocity "
         f"between {slow:.3g} and {fast:.3g} m/s ({_errors_of_a_level(another_day)} included)"
@@ -265,7 +272,8 @@ def _coupled(mode: int, other: int, ratio: int, probability: float, fraction: fl
     moved = "" if np.isnan(fraction) else f", which has up to {100 * fraction:.2g} % of the energy"
     return (
         f"mode {mode} exchanges energy with mode {other} (1:{ratio}, probability "
-        f"{_probable(probability)}){moved}: a backbone of one mode holds where this is little."
+        f"{_probable(probability)}){moved}: a single-mode backbone holds only where this exchange "
+        "is small."
     )
 
 
@@ -281,16 +289,15 @@ def _not_coupled(looked: Sequence[tuple[int, int]]) -> str:
 
 
 def _biased(velocity: float, frequency: float, damping: float, clear: bool) -> str:
-    said = (
-        f"at {velocity:.3g} m/s the backbone of one mode has a natural frequency "
-        f"{100 * frequency:+.2g} % and a damping ratio {100 * damping:+.2g} % from the coupled "
-        "modes'"
+    bias = (
+        f"at {velocity:.3g} m/s the single-mode backbone differs from the coupled modes by "
+        f"{100 * frequency:+.2g} % in natural frequency and {100 * damping:+.2g} % in damping ratio"
     )
-    return f"{said}." if clear else f"{said}: within its error."
+    return f"{bias}." if clear else f"{bias}: within its error."
 
 
 def _outlying(*, states: Sequence[tuple[int, float]], farthest: float, robust: bool) -> str:
-    """States far from the curves, and what was done or can be done about them."""
+    """States far from the curves, and how they are or can be treated."""
     named = [f"level {level} at {hertz:.5g} Hz" for level, hertz in states[:_LISTED]]
     further = f" and {len(states) - _LISTED} further" if len(states) > _LISTED else ""
     lie = "lies" if len(states) == 1 else "lie up to"
@@ -301,7 +308,7 @@ def _outlying(*, states: Sequence[tuple[int, float]], farthest: float, robust: b
     )
     return (
         f"{enumerated(named)}{further} {lie} {farthest:.2g} times the noise from the curves, as "
-        f"states beside a jump do that have not settled: {done}."
+        f"unsettled states next to a jump do: {done}."
     )
 
 
@@ -328,20 +335,19 @@ SENTENCES: dict[str, Wording] = {
     "as_in_file": "{text}",
     "fit_not_converged": _fit_not_converged,
     "family_leaves": lambda curve, family, largest: (
-        f"{family} does not describe the {curve} within the noise: what it leaves, up to "
-        f"{max(100 * largest, 0.01):.2g} % of the {curve}, is drawn as a smooth curve, which bands "
-        "and predictions include."
+        f"{family} does not describe the {curve} within the noise: the remainder, up to "
+        f"{max(100 * largest, 0.01):.2g} % of the {curve}, is fitted by a smooth curve, which "
+        "bands and predictions include."
     ),
     "noise_exceeded": (
-        "the fit misses the data by {scale:.2g} ± {scale_std:.1g} times the stated noise: either "
-        "that noise is too small or the model is wrong; the bands are {scale:.2g} times wider for "
-        "it."
+        "the residuals are {scale:.2g} ± {scale_std:.1g} times the stated noise: either that noise "
+        "is too small or the model is wrong; the bands are widened by the factor {scale:.2g}."
     ),
     "noise_overstated": (
         "states scatter about the curves by only {scale:.2g} ± {scale_std:.1g} times the stated "
-        "noise, errors of whole levels apart: it is overstated."
+        "noise (errors of whole levels excluded): it is overstated."
     ),
-    "frequency_wanders": _wanders,
+    "frequency_wanders": _frequency_scatters,
     "levels_differ": _levels_differ,
     "few_levels": _few_levels,
     "level_beyond_stated": _beyond_stated,
@@ -350,17 +356,17 @@ SENTENCES: dict[str, Wording] = {
     "levels_corrected": _levels_corrected,
     "one_side_of_resonance": lambda near_deg, far_deg, below: (
         f"all states lie on one side of resonance ({near_deg:.0f}° to {far_deg:.0f}° "
-        f"{'below' if below else 'above'} it): a phase error that they share looks like a change "
+        f"{'below' if below else 'above'} it): a common phase error looks like a change "
         "of natural frequency and damping, and the bands include it only if it is stated."
     ),
     "levels_of_one_amplitude": lambda apart: (
         f"the levels' largest amplitudes lie within {max(100 * apart, 0.1):.2g} % of each other: "
-        "how the mode changes with amplitude rests on the smaller states of the same levels alone."
+        "the amplitude dependence rests only on the smaller states of the same levels."
     ),
     "force_gain_near_resonance": (
-        "these data hardly determine the force gain: all states lie within {farthest_deg:.0f}° of "
-        "resonance, where an error of the velocity that changes with the amplitude passes for a "
-        f"gain; the 1σ of gain and damping leave such errors out. {_MEASURE_GAIN}."
+        "these data poorly determine the force gain: all states lie within {farthest_deg:.0f}° of "
+        "resonance, where a velocity error that depends on amplitude looks like a gain; the 1σ of "
+        f"gain and damping exclude such errors. {_MEASURE_GAIN}."
     ),
     "force_gain_undetermined": _undetermined_gain,
     "fit_not_passive": _not_passive,
@@ -372,7 +378,7 @@ SENTENCES: dict[str, Wording] = {
         "solution that amplitude and phase alone would also allow."
     ),
     "shape_not_followed": (
-        "the sensors do not move as the mode shape says (residual up to {residual:%.0f}): check "
+        "the sensors do not move in the stated mode shape (residual up to {residual:%.0f}): check "
         "the shape, or the mode's shape changes with amplitude."
     ),
     "damping_changes_with_phase": _damping_and_phase,
@@ -383,21 +389,21 @@ SENTENCES: dict[str, Wording] = {
     ),
     "points_not_located": _not_located,
     "negative_damping_left_out": (
-        "damping extrapolated to nothing at {load}: {share:%.2g} of the curves have none left "
-        "before a resonance. No passive structure is so: they are left out (`--self-excited` keeps "
-        "them)."
+        "damping extrapolates to zero at {load}: {fraction:%.2g} of the sampled curves have none "
+        "left before a resonance. No passive structure has that: they are left out "
+        "(`--self-excited` keeps them)."
     ),
     "levels_follow_force": _trend,
     "damping_below_zero": lambda velocity, ratio, ratio_std, probability: (
         f"damping at {velocity:.3g} m/s is {100 * ratio:.2g} ± {100 * ratio_std:.2g} % of "
-        f"critical, below zero with probability {probability:.2g}: a passive structure's is not, "
-        "so read the band upwards of zero."
+        f"critical, below zero with probability {probability:.2g}: no passive structure has that, "
+        "so only the part of the band above zero applies."
     ),
     "resonance_of_a_level": _resonance_range,
     "errors_of_a_level": _errors_of_a_level,
     # Advice.
     "advice_of_unconverged_fit": (
-        "the fit that this advice rests on has not converged: another fit may advise other states"
+        "the fit behind this advice has not converged: a converged fit may advise other states"
     ),
-    "band_narrower": "the {curve} band becomes {share:%.2g} narrower",
+    "band_narrower": "the {curve} band becomes {fraction:%.2g} narrower",
 }

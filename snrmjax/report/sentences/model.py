@@ -1,4 +1,4 @@
-"""What models and their effects have to tell."""
+"""Sentences of models and their effects."""
 
 from snrmjax.model.effect_metadata import Part
 from snrmjax.report.sentences import Wording
@@ -8,8 +8,8 @@ def _shape_of_effect(part: Part, power: float | None, harmonic: int | None) -> s
     if part is Part.INSTRUMENTS:
         return "It changes what is recorded, not the motion."
     if part is Part.TIME:
-        return "It changes in the course of the test, not with the amplitude."
-    changes = {None: "", 0.0: " at all amplitudes alike"}.get(
+        return "It changes during the test, not with the amplitude."
+    changes = {None: "", 0.0: " equally at all amplitudes"}.get(
         power, f" with the power {power:g} of the amplitude" if power else ""
     )
     shows = "" if harmonic is None else f" and shows in harmonic {harmonic}"

@@ -1,4 +1,4 @@
-"""What pipelines have to tell beside what their parts tell."""
+"""Sentences of pipelines, in addition to those of their parts."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -8,17 +8,17 @@ from snrmjax.report.sentences import Wording, enumerated, of_levels
 
 _NOT_LOCATED = {
     "branch": (
-        "a further response comes in from above the range, where no motion was found to start it "
+        "a further branch that enters from above the range, where no solution was found to start "
         "from: raise `--to-hz` until the resonance lies inside"
     ),
-    "bifurcation": "a change of stability whose kind or frequency was not found",
+    "bifurcation": "a change of stability whose type or frequency was not determined",
 }
 
 
 def _not_located(force: float, unit: str, kinds: Sequence[str]) -> str:
     counts = Counter(_NOT_LOCATED.get(kind, f"a {kind.replace('_', ' ')}") for kind in kinds)
     each = [text if n == 1 else f"{text} ({n} times)" for text, n in counts.items()]
-    return f"force {force:g} {unit}: there is, but not in response.csv: {'; '.join(each)}."
+    return f"force {force:g} {unit}: detected but missing in response.csv: {'; '.join(each)}."
 
 
 def _ended(force: float, unit: str, status: Status) -> str:
@@ -33,8 +33,8 @@ def _equilibria(
     sensor: str, rest: float, displacement: tuple[float, ...], stable: tuple[bool, ...]
 ) -> str:
     listed = [
-        f"{'stable' if holds else 'unstable'} at {1e3 * place:.3g} mm"
-        for place, holds in zip(displacement, stable, strict=True)
+        f"{'stable' if is_stable else 'unstable'} at {1e3 * position:.3g} mm"
+        for position, is_stable in zip(displacement, stable, strict=True)
     ]
     several = "one further equilibrium" if len(listed) == 1 else f"{len(listed)} further equilibria"
     start = "rest" if rest == 0.0 else f"the one at {1e3 * rest:.3g} mm"
@@ -61,29 +61,29 @@ def _element_idle(force: float, unit: str, element: str, slides: bool, fraction:
     whole = "slip displacement" if slides else "gap"
     makes = f"more force makes it {more}" if slides else f"more force would {more}"
     return (
-        f"force {force:g} {unit}: {element} {state} throughout this range (the motion takes "
+        f"force {force:g} {unit}: {element} {state} throughout this range (the motion reaches "
         f"{100 * fraction:.3g} % of its {whole}): {makes}."
     )
 
 
-def _held(force: float, unit: str, element: str, slides_from: float) -> str:
+def _stuck(force: float, unit: str, element: str, slides_from: float) -> str:
     if force < slides_from:
         return (
-            f"force {force:g} {unit}: {element} holds the structure: in this range it slides from "
-            f"about {slides_from:.3g} {unit} on; raise the force."
+            f"force {force:g} {unit}: {element} sticks: in this range it slides only above about "
+            f"{slides_from:.3g} {unit}; raise the force."
         )
     return (
-        f"force {force:g} {unit}: no motion was found where the range starts, though {element} "
-        f"slides from about {slides_from:.3g} {unit} on: it may stick for a part of the period; "
-        "raise the force, or use more --harmonics."
+        f"force {force:g} {unit}: no solution was found at the start of the range, although "
+        f"{element} slides above about {slides_from:.3g} {unit}: it may stick for part of the "
+        "period; raise the force, or use more --harmonics."
     )
 
 
 def _load_scale(stated: float, coefficient: str, change: float, chosen: float) -> str:
     return (
         f"with `load_scale` = {stated:g} thicknesses the coefficient {coefficient} differs by "
-        f"{100 * change:+.0f} % from that of {chosen:.2g} thicknesses, the scale that is chosen "
-        "where none is stated"
+        f"{100 * change:+.0f} % from that of {chosen:.2g} thicknesses, the scale chosen "
+        "by default"
     )
 
 
@@ -93,13 +93,13 @@ def _by_import(advice: object, commands: tuple[str, ...]) -> str:
 
 SENTENCES: dict[str, Wording] = {
     "outlying_left_out": (
-        "{n:#state} far from the curves of one mode left out of the diagnosis (see the backbone)."
+        "{n:#state} far from the single-mode curves left out of the diagnosis (see the backbone)."
     ),
     "advice_by_import": _by_import,
-    "advice_at_once": "{names} at once: {command}. Alone, {alone}",
+    "advice_at_once": "{names} together: {command}. Separately, {alone}",
     "load": _load,
     "level_missed_by_curves": (
-        "level {level} has its resonance under {force:.4g} N, measured at {frequency_hz:.5g} Hz, "
+        "level {level} has its resonance at {force:.4g} N, measured at {frequency_hz:.5g} Hz, "
         "{velocity:.3g} m/s: the curves miss this level."
     ),
     "resonance_beyond_data": ("the resonance at {load} lies beyond the measured amplitudes."),
@@ -109,7 +109,7 @@ SENTENCES: dict[str, Wording] = {
     ),
     "force_from_drive": (
         "forces in N are drive voltage times the fitted gain ({newtons_per_volt:.4g} N/V ± "
-        "{relative_std:%.2g}); if the model's modal mass is wrong, so is the gain."
+        "{relative_std:%.2g}); an error of the model's modal mass is also one of the gain."
     ),
     "fewer_advised": "{n} of {wanted} further measurements are advised: {why}.",
     "resonances_missed": lambda *, levels: (
@@ -126,15 +126,14 @@ SENTENCES: dict[str, Wording] = {
         "frequency range: a resonance may be missing there."
     ),
     "diagnosis_left_out": (
-        "The diagnosis was left out, as it would explain an error of the columns by effects that "
-        "the structure does not have: {why} `snrmjax diagnose` of measured.csv does it "
-        "nevertheless."
+        "The diagnosis was skipped, as it would attribute an error of the columns to effects that "
+        "the structure does not have: {why} `snrmjax diagnose` of measured.csv runs it anyway."
     ),
     "sensor_not_named": (
-        "no sensor is named in {files}: taken for the model's only one, {sensor}. A column "
-        "`sensor`, or `--sensor` of the import, states it."
+        "no sensor is named in {files}: the model's only one, {sensor}, is assumed. Name it in a "
+        "column `sensor`, or by `--sensor` of the import."
     ),
-    "no_joint_fit": ("curves go through single points, as a joint fit was not possible: {why}"),
+    "no_joint_fit": ("curves are fitted to single points, as a joint fit was not possible: {why}"),
     "isolated_searched": (
         "{n} further branches found at {force:g} N, of {n_starts} starts ({n_failed} failed)"
     ),
@@ -144,42 +143,41 @@ SENTENCES: dict[str, Wording] = {
     ),
     "no_event_to_follow": "no response has a {event} to follow.",
     "harmonics_left_out": (
-        "the harmonics above {harmonics} would change the velocity by up to about {share:%.2g} "
+        "the harmonics above {harmonics} would change the velocity by up to about {fraction:%.2g} "
         "somewhere; use more --harmonics."
     ),
     "internal_resonance": (
         "internal resonance 1:{harmonic} with mode {mode} from {from_hz:.5g} to {to_hz:.5g} Hz: "
-        "harmonic {harmonic} drives it, with up to {share:%.3g} of the energy"
+        "harmonic {harmonic} drives it, with up to {fraction:%.3g} of the energy"
     ),
     "mode_unstable": (
-        "the mode is unstable on {n} points from {from_hz:.5g} to {to_hz:.5g} Hz: free motions "
-        "leave it there"
+        "the mode is unstable at {n} points from {from_hz:.5g} to {to_hz:.5g} Hz: free motions "
+        "depart from it there"
     ),
     "mode_not_followed": _not_followed,
     "no_stable_response": _no_stable_response,
     "element_idle": _element_idle,
-    "held_by_friction": _held,
+    "held_by_friction": _stuck,
     "damping_not_known": (
-        "the damping ratio of mode {mode} is known to ± {relative_std:%.1g} (1σ) only, and so is a "
-        "peak there: stated in the model, or entries of its damping matrix are rounded (of a fine "
-        "mesh give `damping_ratio`, or a multiple of the stiffness)."
+        "the damping ratio of mode {mode} is known only to ± {relative_std:%.1g} (1σ), and so is a "
+        "peak there: as stated in the model, or from rounded entries of its damping matrix (for a "
+        "fine mesh state `damping_ratio`, or a multiple of the stiffness)."
     ),
     "curve_ended": _ended,
     "curve_events_not_located": _not_located,
     "stability_not_computed": (
         "force {force:g} {unit}: the stability of {n} points could not be computed; response.csv "
-        "has 0 there and says so in `event`."
+        "has 0 there, with a mark in `event`."
     ),
     "further_equilibria": _equilibria,
     "load_scale_outside_plateau": (
         "the load scale of the model is not inside a plateau of the coefficients"
     ),
     "several_equilibria": (
-        "the reduced model has {n} stable equilibria: responses may end in another one than rest"
+        "the reduced model has {n} stable equilibria: responses may settle in one other than rest"
     ),
     "load_scale_compared": _load_scale,
     "load_scale_not_compared": (
-        "`load_scale` = {stated:g} thicknesses cannot be compared with a scale that is chosen: "
-        "{why}"
+        "`load_scale` = {stated:g} thicknesses cannot be compared with the default scale: {why}"
     ),
 }

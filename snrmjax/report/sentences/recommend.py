@@ -1,4 +1,4 @@
-"""What to measure next so that a diagnosis is decided."""
+"""Sentences on what to measure next to decide a diagnosis."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ _UNITS = {"velocity": "m/s", "frequency": "Hz"}
 
 
 def _recommended(*, measurements: Sequence[object]) -> str:
-    """Each measurement once: the one that says most of those that begin alike."""
+    """Each measurement once, without those whose text is part of another."""
     texts = [str(measurement).rstrip(".") for measurement in measurements]
     texts = list(dict.fromkeys(f"{text[0].upper()}{text[1:]}" for text in texts))
     return " ".join(
@@ -46,10 +46,10 @@ def _measure(
             f"measure {states} states 30° to 60° off resonance, on both sides, at {named} {at}: "
             f"{difference}."
         )
-    beside = f", with {closely}" if closely else ""
+    in_addition = f", with {closely}" if closely else ""
     return (
         f"add a level of {force:.3g} N, {scale:g} times the velocities of level {level}, with "
-        f"{states} states within 55° of resonance {at}{beside}: {difference}."
+        f"{states} states within 55° of resonance {at}{in_addition}: {difference}."
     )
 
 
@@ -61,10 +61,10 @@ def _harmonics_apart(
     turned_deg: float | None,
 ) -> str:
     one, other = (f"{round(100 * fraction, 6):.2g} %" for fraction in fractions)
-    turn = "" if turned_deg is None else f", turned by {turned_deg:.0f}°"
+    shift = "" if turned_deg is None else f" (phase shifted by {turned_deg:.0f}°)"
     return (
         f"harmonic {harmonic} is {one} of the fundamental with {effect_names(models[0])}, "
-        f"{other}{turn} with {effect_names(models[1])}"
+        f"{other}{shift} with {effect_names(models[1])}"
     )
 
 
@@ -82,12 +82,12 @@ SENTENCES: dict[str, Wording] = {
     "recommendation": _recommended,
     "record_phase": "record the phase of the velocity relative to the force.",
     "no_test_settles": (
-        "no single test that was compared is expected to decide; the most informative one follows."
+        "none of the tests compared is expected to decide; the most informative one follows."
     ),
     "measure_test": _measure,
     "motion_of_one": lambda *, models: (
-        f"with {effect_names(models[0])} there is such a motion, with {effect_names(models[1])} "
-        "there is none"
+        f"such a motion exists with {effect_names(models[0])}, but not with "
+        f"{effect_names(models[1])}"
     ),
     "harmonics_apart": _harmonics_apart,
     "velocities_apart": lambda *, models, fraction: (

@@ -31,7 +31,7 @@ from snrmjax.study.uncertainty.sensitivity import FEWEST
 
 _BINS = 40
 _ROW = 2.3  # inches: the height of a row of panels
-_ACROSS = 3  # panels beside one another
+_ACROSS = 3  # panels side by side
 _DOTS = 400  # of a scatter: more hide one another
 _LINES = 3  # of a title: of the largest forces
 _PALE, _CLOUD = 0.13, 0.35
@@ -67,7 +67,7 @@ def _histogram(axes: Axes, output: Sequence[Scalar]) -> None:
     if output[0].is_count:
         edges = np.arange(known.min() - 0.5, known.max() + 1.0)
     else:
-        # Far outliers are not drawn apart: they would leave the rest one bar.
+        # Far outliers get no bins of their own: the rest would be one bar.
         low, high = np.quantile(known, [0.001, 0.999])
         edges = np.linspace(low, high, _bins(known.size)) / shown.size
     for one, colour in zip(output, _colours(len(output)), strict=True):
@@ -91,7 +91,7 @@ def _histogram(axes: Axes, output: Sequence[Scalar]) -> None:
 
 
 def _part(output: Sequence[Scalar]) -> str:
-    """How many members have a number and how many lie outside the range, a line where not all."""
+    """Members with a value and outside the range, one line per force where some have none."""
     lines = []
     for row in map(summarized, output):
         known = row.described - row.outside
@@ -120,8 +120,8 @@ def main_effects_figure(
             _scatter(axes, one, name, quantities[name], (x, y))
             broken = name.replace(".", ".\n", 1) if len(names) > _ACROSS else name
             below = plain(x.labelled(broken)) if k == len(shown) - 1 else ""
-            beside = plain(y.labelled(readable(one.outputs[0].name))) if j == 0 else ""
-            name_axes(axes, "", below, beside)
+            label = plain(y.labelled(readable(one.outputs[0].name))) if j == 0 else ""
+            name_axes(axes, "", below, label)
             _fraction(axes, one, name)
             if j:
                 axes.sharey(line[0])
@@ -144,10 +144,10 @@ def _scatter(
     colours = _colours(len(shown.outputs))
     for output, effects, colour in zip(shown.outputs, shown.effects, colours, strict=True):
         effect, few = effects[name], output.n_known < FEWEST
-        size, alpha = (8.0, 0.9) if few else (2.5, _CLOUD)
-        dots: Style = {"linestyle": "none", "marker": ".", "markersize": size, "alpha": alpha}
+        diameter, alpha = (8.0, 0.9) if few else (2.5, _CLOUD)
+        dots: Style = {"linestyle": "none", "marker": ".", "markersize": diameter, "alpha": alpha}
         values = output.values[chosen] / y.size
-        # Where no mean is drawn, the dots alone tell the forces apart.
+        # Where no mean is drawn, only the dots distinguish the forces.
         named = _force(output.force) if effect is None else ""
         axes.plot(
             *(quantity[chosen] / x.size, values),
@@ -167,7 +167,7 @@ def _scatter(
 
 
 def _fraction(axes: Axes, shown: OutputEffects, name: str) -> None:
-    """The share of variance above a panel, of the smallest and the largest force; and of whom."""
+    """Fraction of variance above a panel, range over the forces, and the members it refers to."""
     known = [effects[name] for effects in shown.effects]
     fractions = [100 * max(one.fraction, 0.0) for one in known if one is not None]
     words = []
@@ -213,9 +213,9 @@ def failures_figure(
     quantities: dict[str, Float[np.ndarray, " member"]],
     units: dict[str, str],
 ) -> Figure:
-    """Where members failed: over the two most telling quantities, and the share along each.
+    """Where members failed: over the two most influential quantities, and the fraction along each.
 
-    Arguments: `quantities` in the order in which they tell failed members from whole ones.
+    Arguments: `quantities` in the order in which they distinguish failed from complete members.
     """
     names = list(quantities)
     figure, grid = _grid(len(names) + 1, 2.6, 0.5)
@@ -226,7 +226,9 @@ def failures_figure(
         along = failure_fraction(quantities[name], failures.failed)
         middle = 0.5 * (along.edges[1:] + along.edges[:-1])
         shown: Style = {"color": IDENTIFIED, "alpha": 0.35}
-        axes.bar(middle, 100 * along.fraction, np.diff(along.edges), **shown, label="share failed")
+        axes.bar(
+            middle, 100 * along.fraction, np.diff(along.edges), **shown, label="fraction failed"
+        )
         bars = 100 * np.abs(np.array([along.fraction - along.low, along.high - along.fraction]))
         style: Style = {"fmt": "none", "ecolor": "0.3", "elinewidth": 0.8}
         axes.errorbar(middle, 100 * along.fraction, bars, **style, label="95 % interval")
@@ -235,13 +237,13 @@ def failures_figure(
     return figure
 
 
-def _map(axes: Axes, failures: Failures, places: Sequence[np.ndarray]) -> None:
-    x = places[0]
-    y = places[1] if len(places) > 1 else np.arange(len(x))
-    whole = np.flatnonzero(~failures.failed)
-    whole = whole[_thinned(len(whole))]
+def _map(axes: Axes, failures: Failures, positions: Sequence[np.ndarray]) -> None:
+    x = positions[0]
+    y = positions[1] if len(positions) > 1 else np.arange(len(x))
+    complete = np.flatnonzero(~failures.failed)
+    complete = complete[_thinned(len(complete))]
     dots: Style = {"linestyle": "none", "marker": ".", "markersize": 3.0, "markeredgewidth": 0.0}
-    axes.plot(x[whole], y[whole], **dots, color="0.7", label="complete")
+    axes.plot(x[complete], y[complete], **dots, color="0.7", label="complete")
     kinds = list(failures.failed_counts)
     groups = [(kind, [kind]) for kind in kinds[: len(SERIES) - 1]]
     if len(kinds) >= len(SERIES):
@@ -293,7 +295,7 @@ def _bins(n: int) -> int:
 
 
 def _thinned(n: int) -> np.ndarray:
-    """Places of at most `_DOTS` of n members, drawn at random: every k-th may be a pattern."""
+    """Indices of at most `_DOTS` of n members, drawn at random: every k-th may be a pattern."""
     if n <= _DOTS:
         return np.arange(n)
     return np.sort(np.random.default_rng(0).choice(n, _DOTS, replace=False))

@@ -23,7 +23,7 @@ from snrmjax.report.study.words import display, of_members, span_in_words
 from snrmjax.report.style import printed
 from snrmjax.study.analysis.bands import SAMPLED, curve_bands
 from snrmjax.study.analysis.digest import StudyDigest, digest, effects_frame, ranked_effects
-from snrmjax.study.analysis.failures import most_telling
+from snrmjax.study.analysis.failures import ranked_by_failure
 from snrmjax.study.analysis.outputs import ScalarSummary, summary_frame
 from snrmjax.study.computations.base import COMPLETE, FORCE, MEMBER
 from snrmjax.study.uncertainty.sensitivity import MainEffect
@@ -38,31 +38,31 @@ _ROWS, _COLUMNS = 4, 4  # panels of a figure of main effects
 _PANELS = 12  # of a figure of distributions
 _SPREAD = ("n_folds", "n_solved")  # counts whose distribution is worth a panel
 _ANSWERS, _MOST_ANSWERS = ("verdict", "effects"), 12
-_TELLING = 5  # quantities along which failures are drawn
+_DRAWN = 5  # quantities along which failures are drawn
 
 DISTRIBUTIONS = (
-    "How the outputs are distributed over the members that have them, whose number stands above "
-    "each panel where it is not all. Lines are the median and, dotted, the ends "
+    "Distribution of the outputs over the members that have them; their number is given above a "
+    "panel where some have none. Lines are the median and, dotted, the ends "
     "of the 95 % range, members beyond the range of frequencies "
-    "included; what lies beyond the outermost thousandth on either side is counted in the "
+    "included; the outermost thousandth on either side is counted in the "
     "last bars."
 )
 EFFECTS = (
-    "Each output (rows) over each varied quantity (columns). Dots are some of the members, lines "
-    "the mean of all members with that value, with its 95 % band; members without a number are in "
-    "neither. Above a panel: the share of the "
-    "output's variance that the quantity makes alone. Dots far from the line that one panel shows "
-    "are the work of the other quantities."
+    "Each output (rows) against each varied quantity (columns). Dots are some of the members, "
+    "lines the mean of all members with that value, with its 95 % band; members without a value "
+    "are in neither. Above a panel: the fraction of the output's variance due to the quantity "
+    "alone. Scatter of the dots about the line is due to the other quantities."
 )
 BANDS = (
-    "Curves of the members: median, 95 % and all of those that have a curve at each place. "
+    "Curves of the members: median, 95 % and all of those that have a curve at each abscissa. "
     "Where a response folds, it has several values at a frequency; the highest and the lowest are "
-    "drawn apart. Bands end "
-    "where fewer than nine tenths of all members have a curve: the rest would tell of itself only."
+    "drawn separately. Bands end "
+    "where fewer than nine tenths of all members have a curve: the rest would not be "
+    "representative."
 )
 FAILED = (
-    "Where members have no whole result: over the two quantities in which they differ most from "
-    "the others, and the share that failed along each quantity, with its 95 % interval."
+    "Members without a complete result: over the two quantities in which they differ most from "
+    "the others, and the fraction that failed along each quantity, with its 95 % interval."
 )
 
 
@@ -103,16 +103,18 @@ def write_study_report(folder: Path, data: "xarray.Dataset") -> StudyDigest:
 
 
 def members_ended(study: StudyDigest) -> str:
-    """How many members have no whole result, and of each kind of failure, in one sentence."""
+    """The number of members without a complete result, by kind of failure, in one sentence."""
     failures = study.failures
     if not failures.n_failed:
-        return f"{study.n_members} members, all with a whole result."
+        return f"{study.n_members} members, all with a complete result."
     each = ", ".join(f"{count} {name}" for name, count in failures.failed_kinds)
-    return f"{study.n_members} members, of which {failures.n_failed} have no whole result: {each}."
+    return (
+        f"{study.n_members} members, of which {failures.n_failed} have no complete result: {each}."
+    )
 
 
 def study_sentence(study: StudyDigest) -> str:
-    """What a study found, in one or two plain sentences."""
+    """The result of a study in one or two plain sentences."""
     if not study.effects:
         return members_ended(study)
     last, effects = study.effects[0].outputs[-1], study.effects[0].effects[-1]  # the largest force
@@ -129,7 +131,7 @@ def study_sentence(study: StudyDigest) -> str:
     order = ranked_effects(effects)
     if order:
         name, one = order[0]
-        text += f"; {name} alone makes {100 * max(one.fraction, 0.0):.0f} % of its variance"
+        text += f"; {name} alone causes {100 * max(one.fraction, 0.0):.0f} % of its variance"
         if last.n_known < row.members:
             text += f" over the {last.n_known} members with a value"
     return f"{members_ended(study)} {text}."
@@ -170,7 +172,7 @@ def _median_and_range(row: ScalarSummary) -> tuple[str, str]:
 
 
 def _effects_table(study: StudyDigest) -> ReportTable:
-    """The strongest quantities of every output, and what none of them explains alone."""
+    """The most influential quantities of every output, and the variance due to none alone."""
 
     def cell(name: str, one: MainEffect) -> str:
         return f"{name}: {100 * max(one.fraction, 0.0):.0f} ± {100 * one.half_width:.0f} %"
@@ -194,9 +196,9 @@ def _effects_table(study: StudyDigest) -> ReportTable:
     return ReportTable(
         ("output", "of", *(f"{k + 1}." for k in range(_RANKS)), "not by one alone"),
         rows,
-        "Share of the output's variance that each quantity makes alone (first-order index, ± 95 %),"
-        " the strongest first. The last column is left to interactions and, in tests, to noise. "
-        "Shares are of the members that have a number; all shares are in main_effects.csv.",
+        "Fraction of the output's variance due to each quantity alone (first-order index, ± 95 %), "
+        "largest first. The last column is due to interactions and, in tests, to noise. Fractions "
+        "refer to the members that have a value; all of them are in main_effects.csv.",
     )
 
 
@@ -212,7 +214,7 @@ def _status_table(study: StudyDigest, data: "xarray.Dataset") -> ReportTable:
         for name, count in counts.items()
     ]
     each = "members and forces" if FORCE in data["status"].dims else "members"
-    header = ("status", each, "share", "complete")
+    header = ("status", each, "fraction", "complete")
     return ReportTable(header, rows, "How the computations ended.")
 
 
@@ -239,9 +241,9 @@ def _distributions(folder: Path, study: StudyDigest) -> Section:
         figure = distributions_figure(shown[k : k + _PANELS])
         figures.append(_saved(folder, name, figure, DISTRIBUTIONS))
     caption = (
-        "The outputs over the members that have them, as the column of members says; where a value "
-        "is known to lie outside the computed range, the member counts there. Further quantiles "
-        "are in summary.csv."
+        "The outputs over the members that have them, see the column of members; where a value is "
+        "known to lie outside the computed range, the member counts on that side. Further "
+        "quantiles are in summary.csv."
     )
     rows = [
         row
@@ -296,7 +298,7 @@ def _answers(folder: Path, data: "xarray.Dataset") -> Section | None:
     n, whose = int(answered.sum()), of_members(int(answered.sum()), data.sizes[MEMBER])
     tables = [
         ReportTable(
-            (name.lower(), "members", "share"),
+            (name.lower(), "members", "fraction"),
             [(text or "none", str(k), f"{100 * k / n:.3g} %") for text, k in answers.items()],
             f"Of {whose}: those with an answer." if n < data.sizes[MEMBER] else "",
             folded=f"All answers: {name.lower()}",
@@ -311,11 +313,11 @@ def _answers(folder: Path, data: "xarray.Dataset") -> Section | None:
 def _failures(folder: Path, study: StudyDigest, data: "xarray.Dataset") -> Section:
     table = _status_table(study, data)
     if not study.failures.n_failed:
-        return Section("Failures", ("Every member has its whole result.",), (), [table])
-    text = f"{study.failures.n_failed} of {study.n_members} members have no whole result."
+        return Section("Failures", ("Every member has a complete result.",), (), [table])
+    text = f"{study.failures.n_failed} of {study.n_members} members have no complete result."
     if not study.quantities:
         return Section("Failures", (text,), (), [table])
-    names = most_telling(study.quantities, study.failures.failed)[:_TELLING]
+    names = ranked_by_failure(study.quantities, study.failures.failed)[:_DRAWN]
     drawn = {name: study.quantities[name] for name in names}
     figure = failures_figure(study.failures, drawn, study.units)
     return Section("Failures", (text,), [_saved(folder, "failures", figure, FAILED)], [table])

@@ -1,4 +1,4 @@
-"""The units in which a study's numbers read well."""
+"""Units and wording of the numbers of a study."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from snrmjax.report.html import number, ten_to
 from snrmjax.report.style import unit_for
 
 _FEWEST_DIGITS, _MOST_DIGITS = -2, 4  # powers of ten that axes are written with
-_PREFIXED = ("m/s", "N", "J")  # units that read better with a prefix where numbers are small
+_PREFIXED = ("m/s", "N", "J")  # units shown with a prefix where numbers are small
 
 
 class Display(NamedTuple):
@@ -29,7 +29,7 @@ _PLAIN = Display(1.0, "")
 def span_in_words(
     *values: float, ends: tuple[float, float] = (-np.inf, np.inf), shown: Display = _PLAIN
 ) -> str:
-    """A value, or from one to another; -inf and inf are below and above the ends of the range.
+    """A value or a range; -inf and inf are below and above the ends of the range.
 
     >>> span_in_words(84.0, np.inf, ends=(70.0, 110.0))
     '84 to above 110'
@@ -40,7 +40,7 @@ def span_in_words(
 
 
 def of_members(known: int, members: int) -> str:
-    """How many of the members something is said of.
+    """The number of members that a statement refers to.
 
     >>> of_members(27, 100), of_members(100, 100)
     ('27 of 100 members', '100 members')
@@ -49,7 +49,7 @@ def of_members(known: int, members: int) -> str:
 
 
 def display(values: Float[np.ndarray, "..."], unit: str) -> Display:
-    """The unit in which values of this unit read well."""
+    """The unit, with a prefix where suitable, in which to show values."""
     if unit in _PREFIXED and np.any(np.isfinite(values)):
         return Display(*unit_for(values, unit))
     return Display(1.0, "" if unit == "1" else unit)

@@ -1,4 +1,4 @@
-"""Numbers that a user gives: checked once, in the same words everywhere."""
+"""Checks of the numbers that a user gives, with the same messages everywhere."""
 
 from typing import Any
 
@@ -8,23 +8,23 @@ from jaxtyping import Float
 
 
 def positive(name: str, values: Any) -> Float[np.ndarray, " value"]:
-    """One or many numbers in a row; within `jit`, where they have no values, NaN.
+    """One or many numbers as a flat array; NaN within `jit`, where they have no values.
 
-    Raises `ValueError` unless there is one at least and all are positive and finite.
+    Raises `ValueError` if there is none, or one that is not positive and finite.
     """
     if isinstance(values, jax.core.Tracer):
         return np.full(values.shape, np.nan)
-    row = np.asarray(values, dtype=np.float64).ravel()
-    wrong = row[~((row > 0) & np.isfinite(row))]
+    numbers = np.asarray(values, dtype=np.float64).ravel()
+    wrong = numbers[~((numbers > 0) & np.isfinite(numbers))]
     if wrong.size:
         raise ValueError(f"`{name}` must be positive and finite, but is {float(wrong[0]):g}.")
-    if not row.size:
+    if not numbers.size:
         raise ValueError(f"`{name}` must have at least one number, but is empty.")
-    return row
+    return numbers
 
 
 def frequency_range(from_frequency: float, to_frequency: float) -> Float[np.ndarray, " end"]:
-    """Both ends in rad/s. Raises `ValueError` when they are no range."""
+    """Both ends in rad/s. Raises `ValueError` for an empty, negative or infinite range."""
     if not 0 < from_frequency < to_frequency < np.inf:
         raise ValueError(
             "`from_frequency` must be positive and below a finite `to_frequency`, but they are "

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from snrmjax.model.averaging import AveragedForce
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractNonsmooth
-from snrmjax.model.elements import AlikeForces, elements_of
+from snrmjax.model.elements import ForceGroup, elements_of
 from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, linear_terms_of
@@ -27,7 +27,7 @@ from snrmjax.simulate.balance.harmonics import (
     tangent_blocks,
 )
 
-BY_CYCLE = (AbstractHysteresis, AbstractNonsmooth)  # whose force needs the whole cycle
+BY_CYCLE = (AbstractHysteresis, AbstractNonsmooth)  # evaluated over a whole cycle
 
 
 class HarmonicBalance(eqx.Module):
@@ -35,11 +35,11 @@ class HarmonicBalance(eqx.Module):
 
     `x` holds the (coefficient, mode) displacements divided by `displacement_scale`, flattened;
     λ is the frequency divided by `frequency_scale`. Without a force and with `cosine_only` the
-    solutions are the conservative normal modes (damping and velocities are left out).
+    solutions are the conservative normal modes (without damping and velocity-dependent forces).
     """
 
     model: Structure
-    force: Float[Array, ""]  # N, amplitude of a cosine; or the multiple of an unbalance
+    force: Float[Array, ""]  # N, amplitude of a cosine; or a multiple of the unbalance
     displacement_scale: Float[Array, ""]  # kg^1/2 m
     frequency_scale: Float[Array, ""]  # rad/s
     harmonic_order: int = eqx.field(static=True)
@@ -75,7 +75,7 @@ class HarmonicBalance(eqx.Module):
     ) -> tuple[Float[np.ndarray, "point coefficient mode"], Float[np.ndarray, " point"]]:
         """Coefficients (kg^1/2 m) and frequencies (rad/s) of scaled points (x, λ), on the host.
 
-        Of a stacked balance: `owner` says of which one every point is.
+        For a stacked balance `owner` is the index of each point's balance.
         """
         scale, unit = np.asarray(self.displacement_scale), np.asarray(self.frequency_scale)
         if owner is not None:
@@ -89,7 +89,7 @@ class HarmonicBalance(eqx.Module):
         return newtons(self.model.modes.unbalance, omega * self.frequency_scale, self.force)
 
     def load(self) -> Float[Array, " equation"]:
-        """Scaled force of one newton: the right-hand side where `newtons` is 1."""
+        """Scaled load of a force of one newton: the right-hand side for `newtons` = 1."""
         model = self.model
         if self.cosine_only:
             return jnp.zeros(self.size)
@@ -132,7 +132,7 @@ class HarmonicBalance(eqx.Module):
         residual = balance.reshape(-1) - self.newtons(omega) * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
-        # Adding zeros beside the diagonal is faster than writing to its entries one by one.
+        # Adding zeros off the diagonal is faster than updating its entries in place.
         of_inertia = np.diag(h2[:, 0])[..., None, None]
         of_damping = basis.derivative[..., None, None]
         if model.potential.monomials:
@@ -155,7 +155,7 @@ class HarmonicBalance(eqx.Module):
     def _elements(
         self, samples: Array, by_omega: Array, omega: Array
     ) -> tuple[Float[Array, "coefficient coefficient mode mode"], Float[Array, "coefficient mode"]]:
-        """What forces of effects add to the blocks and to the column of λ."""
+        """Contributions of the nonlinear elements to the blocks and to the column of λ."""
         model, fs = self.model, self.frequency_scale
         basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
         unit = fs**2 * self.displacement_scale
@@ -176,44 +176,44 @@ class HarmonicBalance(eqx.Module):
             def along(direction: Array, direction_rate: Array) -> Array:
                 return jax.jvp(by_cycle.cycle_force, (x, v), (direction, direction_rate))[1] / unit
 
-            # One direction moves all places: a force feels its own alone.
-            every = jnp.ones(elements.n_places)
+            # One direction moves all attachment points at once: a force depends on its own alone.
+            every = jnp.ones(elements.n_attachments)
             by_shape = jax.vmap(along)(shapes[..., None] * every, rates[..., None] * every)
             block = block + jnp.einsum("ct,dtp->cdp", basis.analysis, by_shape)
             change = change + along(jnp.zeros_like(x), v_omega)
         blocks = elements.matrix(block)
         for group in across.groups:
-            pair = group.taken(x), group.taken(v)
-            added, values = _across(group, pair, (shapes, rates), group.taken(v_omega))
+            pair = group.gathered(x), group.gathered(v)
+            added, values = _across(group, pair, (shapes, rates), group.gathered(v_omega))
             local = jnp.einsum("ct,djtfi->cdfij", basis.analysis, added / unit)
-            rows = elements.rows[group.places]
-            blocks = blocks + jnp.einsum("cdfij,fim,fjn->cdmn", local, rows, rows)
-            change = change + elements.at_places(group, values / unit)
+            influence = elements.influence[group.attachments]
+            blocks = blocks + jnp.einsum("cdfij,fim,fjn->cdmn", local, influence, influence)
+            change = change + elements.summed(group, values / unit)
         return blocks, elements.on_modes(jnp.asarray(basis.analysis) @ change)
 
 
 def _across(
-    group: AlikeForces,
+    group: ForceGroup,
     pair: tuple[Array, Array],
     directions: tuple[Array, Array],
     v_omega: Float[Array, "time force row"],
 ) -> tuple[Float[Array, "direction moved time force row"], Float[Array, "time force row"]]:
-    """Derivatives of forces at several rows each: by every direction of every row, and by Ω.
+    """Derivatives of forces with several displacements: by every direction of each, and by Ω.
 
     Arguments: displacement and velocity `pair` (time, force, row) of the forces, the `directions`
-    of displacements and of velocities (direction, time), and the derivative of the velocity by Ω.
+    of displacements and of velocities (direction, time), and the derivative of velocity by Ω.
     """
 
     def along(moved: Array, rate: Array) -> Float[Array, "time force row"]:
         return jax.jvp(group.cycle_force, pair, (moved, rate))[1]
 
     def of_row(direction: Array, rate: Array, row: Array) -> Array:
-        # One direction moves one row of every force of the group.
-        every = jnp.ones(group.places.shape) * row
+        # One direction moves one displacement of every force of the group.
+        every = jnp.ones(group.attachments.shape) * row
         return along(direction[:, None, None] * every, rate[:, None, None] * every)
 
     of_rows = jax.vmap(jax.vmap(of_row, (None, None, 0)), (0, 0, None))
-    by_row = of_rows(*directions, jnp.eye(group.places.shape[1]))
+    by_row = of_rows(*directions, jnp.eye(group.attachments.shape[1]))
     return by_row, along(jnp.zeros_like(v_omega), v_omega)
 
 
@@ -229,9 +229,9 @@ def harmonic_balance(
     """The balance of `model` under a cosine force of amplitude `force` (N).
 
     `n_samples` defaults to the alias-free number for a polynomial potential and to at least
-    128 when there are effects with forces, which are not polynomial.
-    Raises `ValueError` when `harmonic_order` is below 1 or the samples are too few to tell the
-    harmonics apart.
+    128 with nonlinear elements, which need not be polynomial.
+    Raises `ValueError` when `harmonic_order` is below 1 or the samples are too few to resolve
+    the harmonics.
     """
     n_samples = samples_for(model, harmonic_order, n_samples)
     modes = model.modes
@@ -247,7 +247,7 @@ def harmonic_balance(
 
 
 def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) -> int:
-    """Time samples over a period: those asked for, or what the model's forces need.
+    """Time samples over a period: as requested, or as many as the model's forces need.
 
     Raises `ValueError` as `harmonic_balance` does.
     """
@@ -272,11 +272,11 @@ def truncation_error(
     coefficients: Float[Array, "point coefficient mode"],
     frequency: Float[Array, " point"],
 ) -> Float[Array, " point"]:
-    """Estimated share of the velocity that the harmonics left out, H + 1 to 2H, would have.
+    """Estimated relative velocity of the truncated harmonics H + 1 to 2H.
 
-    The forces that the motion exerts at those harmonics, over the linear dynamic stiffness there:
+    The nonlinear forces of the motion at those harmonics, over the linear dynamic stiffness there:
     the first step of a Newton iteration with twice the harmonics. Root mean square over the
-    period and the modes, relative; frequency in rad/s.
+    period and the modes, relative to that of the motion; frequency in rad/s.
     """
     model, order, n = balance.model, balance.harmonic_order, balance.model.n_modes
     basis = harmonic_basis(2 * order, samples_for(model, 2 * order, None))
@@ -297,15 +297,15 @@ def truncation_error(
     square = (force[0::2] ** 2 + force[1::2] ** 2) / (
         stiffness**2 + (terms.damping[:, None] * h * frequency) ** 2
     )
-    left_out = jnp.sum(h**2 * square, axis=(0, 1))
+    truncated = jnp.sum(h**2 * square, axis=(0, 1))
     repeated = np.repeat(np.arange(1, order + 1), 2)[:, None, None]
-    return jnp.sqrt(left_out / jnp.sum((repeated * x[1:]) ** 2, axis=(0, 1)))
+    return jnp.sqrt(truncated / jnp.sum((repeated * x[1:]) ** 2, axis=(0, 1)))
 
 
 def linear_coefficients(
     model: Structure, force: Float[Array, ""], frequency: Float[Array, ""], harmonic_order: int
 ) -> Float[Array, "coefficient mode"]:
-    """Displacement coefficients of the linear response: where a forced response starts."""
+    """Displacement coefficients of the linear response, the start of a forced response."""
     terms = model.linear_terms()
     load = newtons(model.modes.unbalance, frequency, force) * phasor_of_load(model.modes)
     stiffness = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
@@ -320,12 +320,12 @@ def linear_coefficients(
 def resonance_displacement(
     model: Structure, force: float, within: Sequence[float] | np.ndarray | None = None
 ) -> float:
-    """Rough displacement (kg^1/2 m) of the modes that move at resonance: a scale, no result.
+    """Rough displacement (kg^1/2 m) of the resonant modes: a scale for unknowns, not a result.
 
-    Those are the modes of `resonant_modes`. Of each it solves 2ζ̃ω̃ ω̃ Q = |P| with
-    ω̃² = ω₀² + ¾·4c Q² from its own quartic term, and with the averages of the effects. The damping
-    counts as at least that of ζ = 5e-5, and the scale is at least the static displacement of every
-    mode, so that no motion is small beside it.
+    For each of `resonant_modes` it solves 2ζ̃ω̃ ω̃ Q = |P| with ω̃² = ω₀² + ¾·4c Q² from its own
+    quartic term, and with the averages of the nonlinear elements. The damping is at least that of
+    ζ = 5e-5, and the scale at least the static displacement of every mode, so that no scaled
+    motion is small.
     """
     terms = linear_terms_of(model)
     mass, damping, stiffness = (np.asarray(part) for part in terms[:3])
@@ -349,30 +349,30 @@ def resonance_displacement(
 
 
 def _averaged(
-    model: Structure, mode: int, amplitude: Float[np.ndarray, " size"], frequency: float
-) -> tuple[Float[np.ndarray, " size"], Float[np.ndarray, " size"] | float]:
-    """What a mode's own quartic term and the effects add to its stiffness and damping."""
+    model: Structure, mode: int, amplitude: Float[np.ndarray, " amplitude"], frequency: float
+) -> tuple[Float[np.ndarray, " amplitude"], Float[np.ndarray, " amplitude"] | float]:
+    """Equivalent stiffness and damping of a mode's quartic term and of the nonlinear elements."""
     values = dict(
         zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True)
     )
     quartic = max(3.0 * float(values.get((mode,) * 4, 0.0)), 0.0)
     if not model.forces:
         return quartic * amplitude**2, 0.0
-    row = np.asarray(elements_of(model.forces, model.modes).rows)[:, mode]
-    there = np.abs(row) * amplitude[:, None]
-    each = jax.vmap(averaged_at_places, (None, 0, None))(model, there, frequency)
-    stiffer, damped = (np.asarray(part) @ row**2 for part in each)
+    influence = np.asarray(elements_of(model.forces, model.modes).influence)[:, mode]
+    local = np.abs(influence) * amplitude[:, None]
+    each = jax.vmap(averaged_at_attachments, (None, 0, None))(model, local, frequency)
+    stiffer, damped = (np.asarray(part) @ influence**2 for part in each)
     return quartic * amplitude**2 + np.maximum(stiffer, 0.0), damped
 
 
 def resonant_modes(
     model: Structure, within: Sequence[float] | np.ndarray | None = None
 ) -> list[int]:
-    """The modes that a force moves in resonance, the mode of interest before the others.
+    """The modes that a force drives near resonance, the mode of interest first.
 
-    Those that it drives with natural frequencies `within` two frequencies (rad/s), or an octave
-    from them, as nonlinear ones come there; where none is, all that it drives. Without
-    frequencies the mode of interest, where it is driven.
+    Driven modes with natural frequencies `within` two frequencies (rad/s) or an octave of them,
+    since nonlinear resonances shift; if there is none, all driven modes. Without frequencies the
+    mode of interest, if it is driven.
     """
     modes, j = model.modes, model.modes.mode_of_interest
     driven = modes.driven() & (np.asarray(modes.natural_frequency) > 0)
@@ -386,13 +386,13 @@ def resonant_modes(
 
 
 @compiled
-def averaged_at_places(
-    model: Structure, amplitude: Float[Array, " place"], frequency: Float[Array, ""]
+def averaged_at_attachments(
+    model: Structure, amplitude: Float[Array, " attachment"], frequency: Float[Array, ""]
 ) -> AveragedForce:
-    """What the forces of effects add to stiffness and damping at their places, by averaging.
+    """Equivalent stiffness and damping of the nonlinear elements at their attachment points.
 
-    Arguments: amplitudes of x there, places in the order of `elements_of`; `frequency` in rad/s.
-    Nothing where the amplitude is zero.
+    By averaging over a cycle (describing functions). Arguments: amplitudes of x at the attachment
+    points, in the order of `elements_of`; `frequency` in rad/s. Zero for zero amplitude.
     """
     elements, beta = (
         elements_of(model.forces, model.modes),
@@ -401,8 +401,9 @@ def averaged_at_places(
     x, v = amplitude * np.cos(beta), -amplitude * frequency * np.sin(beta)
     force = elements.cycle_force(x, v)
     moves = amplitude > 0
-    size = jnp.where(moves, amplitude, 1.0)
+    divisor = jnp.where(moves, amplitude, 1.0)
     cosine, sine = 2 * jnp.mean(force * np.cos(beta), 0), 2 * jnp.mean(force * np.sin(beta), 0)
     return AveragedForce(
-        jnp.where(moves, cosine / size, 0.0), jnp.where(moves, -sine / (size * frequency), 0.0)
+        jnp.where(moves, cosine / divisor, 0.0),
+        jnp.where(moves, -sine / (divisor * frequency), 0.0),
     )

@@ -20,7 +20,7 @@ class HarmonicBasis(NamedTuple):
     analysis: np.ndarray  # (coefficient, time): its left inverse
     derivative: np.ndarray  # (coefficient, coefficient): d/dτ
     spectrum: np.ndarray  # (order, time): cosine sums of orders 0…2H, then their sine sums
-    row: np.ndarray  # (2, coefficient, coefficient): rows of `spectrum` in each product
+    row: np.ndarray  # (2, coefficient, coefficient): rows of `spectrum` that form each product
     sign: np.ndarray  # (2, coefficient, coefficient): their factors
 
 
@@ -30,8 +30,8 @@ def harmonic_basis(
 ) -> HarmonicBasis:
     """The basis of `harmonic_order` harmonics sampled `n_samples` times over a period.
 
-    With `cosine_only` the sine coefficients are left out: motions that start from rest, which
-    is what the normal modes of a conservative structure are. `derivative` is then zero.
+    With `cosine_only` the sine coefficients are left out: motions that start from rest, such as
+    the normal modes of a conservative structure. `derivative` is then zero.
     """
     tau = 2 * np.pi * np.arange(n_samples) / n_samples
     orders = np.arange(1, harmonic_order + 1)
@@ -57,7 +57,7 @@ def harmonic_basis(
 
 
 def _product_to_sum(harmonic_order: int, cosine_only: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Which two sums make up the product of each pair of basis functions, and with which sign.
+    """The two sums that form the product of each pair of basis functions, and their factors.
 
     cos aτ cos bτ = ½cos(a−b)τ + ½cos(a+b)τ, and likewise with sines.
     """
@@ -120,8 +120,8 @@ def velocity_phasors(
 ) -> Complex[Array, "*batch harmonic sensor"]:
     """Velocity phasors ihΩ Φ X_h at the sensors, h = 0…H, in m/s; differentiable.
 
-    Of NumPy's arrays on the host: a curve is done there before a program has its arguments, and no
-    number of points compiles.
+    NumPy arrays are computed on the host: that is faster for a curve than a call of a program, and
+    does not compile for every number of points.
     """
     real, imaginary = (part @ mode_shape.T for part in _real_and_imaginary(coefficients))
     orders = np.arange(real.shape[-2])
@@ -130,7 +130,7 @@ def velocity_phasors(
 
 
 def _real_and_imaginary(coefficients: Array | np.ndarray) -> tuple[Any, Any]:
-    """Parts of the phasors of the displacement."""
+    """Real and imaginary parts of the displacement phasors."""
     xp = _namespace(coefficients)
     mean, cosines = coefficients[..., :1, :], coefficients[..., 1::2, :]
     sines = coefficients[..., 2::2, :]
@@ -139,7 +139,7 @@ def _real_and_imaginary(coefficients: Array | np.ndarray) -> tuple[Any, Any]:
 
 
 def _complex(real: Any, imaginary: Any) -> Any:
-    """From real parts: jax 0.8 warns in derivatives of real numbers that become complex."""
+    """A complex array from its parts: jax 0.8 warns when it differentiates real to complex."""
     if isinstance(real, np.ndarray) and isinstance(imaginary, np.ndarray):
         return real + 1j * imaginary
     return jax.lax.complex(real, imaginary)
@@ -148,7 +148,7 @@ def _complex(real: Any, imaginary: Any) -> Any:
 def with_sines(
     cosines: Float[Array | np.ndarray, "*batch order mode"],
 ) -> Float[Array, "*batch coefficient mode"]:
-    """Mean and cosines with zero sines in between."""
+    """Mean and cosine coefficients with zero sines inserted."""
     xp = _namespace(cosines)
     orders, modes = cosines.shape[-2:]
     pairs = xp.stack([cosines[..., 1:, :], xp.zeros_like(cosines[..., 1:, :])], axis=-2)
@@ -157,5 +157,5 @@ def with_sines(
 
 
 def _namespace(values: object) -> Any:
-    """NumPy of values on the host, JAX of others."""
+    """NumPy for arrays on the host, JAX for others."""
     return np if isinstance(values, np.ndarray) else jnp

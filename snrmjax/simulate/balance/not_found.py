@@ -1,4 +1,4 @@
-"""What a solver did not find: NaN, and its derivatives NaN as well."""
+"""Solutions that did not converge: NaN, with NaN derivatives."""
 
 from typing import TypeVar
 
@@ -11,20 +11,20 @@ T = TypeVar("T")
 
 
 def nan_unless(found: Bool[Array, ""], values: T, by: PyTree) -> T:
-    """`values` where they were found; else NaN, with derivatives by the numbers of `by` of NaN.
+    """`values` if `found`; else NaN, with NaN derivatives with respect to the numbers of `by`.
 
-    Derivatives of zero would say to an optimiser that it has arrived. In reverse mode they are NaN
+    Zero derivatives would make an optimiser believe it has converged. In reverse mode they are NaN
     only where the result depends on the missing values: a member of a batch that a sum leaves out
-    adds zero to the derivatives by what all members share.
+    adds zero to the derivatives by shared parameters.
     """
     moved = jnp.zeros(())
     for k, a in enumerate(jax.tree.leaves(by)):
         if isinstance(a, jax.Array) and jnp.issubdtype(a.dtype, jnp.floating):
-            # Weights that no direction is across, but by chance.
+            # Generic weights: no direction of differentiation is orthogonal to them.
             weight = np.random.default_rng(k).uniform(1.0, 2.0, a.shape)
             change = jnp.where(jnp.isfinite(a), a - jax.lax.stop_gradient(a), 0.0)
             moved += jnp.sum(weight * change)
-    zero = jnp.expm1(moved)  # whose derivatives are none of them zero, of whatever order
+    zero = jnp.expm1(moved)  # zero, with non-zero derivatives of every order
 
     def or_nan(value: Array) -> Array:
         if jnp.iscomplexobj(value):
@@ -36,10 +36,10 @@ def nan_unless(found: Bool[Array, ""], values: T, by: PyTree) -> T:
 
 
 def _missing(zero: Float[Array, "*shape"], found: Bool[Array, ""]) -> Float[Array, "*shape"]:
-    """Zero, with a derivative of NaN but for what does not move, and where nothing asks for it.
+    """Zero, with NaN derivatives, but zero in directions and cotangents that are zero.
 
-    A linear map that is defined with its transpose. Of the two ways in which JAX lets one do that,
-    this is the one that it also batches.
+    A linear map defined with its transpose. Of JAX's two ways to do so this one supports
+    batching.
     """
 
     def missed(_: object, right: Array) -> Array:

@@ -1,7 +1,7 @@
-"""Prescribed motion: the fundamental at one sensor is given, and the force is solved for.
+"""Prescribed motion: the fundamental at one sensor is given and the force is solved for.
 
 At a given frequency a force may have several motions or, beyond a fold, none; a motion has one
-force. So a measured motion is put into the harmonic balance, and the force is solved for.
+force. So a measured motion is inserted into the harmonic balance, which is solved for the force.
 """
 
 from typing import Any, NamedTuple
@@ -16,15 +16,15 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_phasors
 
-# Growth of a motion, in shares of the velocity that was measured.
+# Amplitude continuation, in fractions of the measured velocity: start, first and least step.
 _SMALL, _FIRST, _SHORTEST = 1e-3, 0.15, 2e-3
-_NEAR = 1e-6  # relative size of a Newton step after which one more is exact to rounding
-_SECANTS = 20  # steps with one Jacobian that is brought up to date, at most
-_CLOSE = 1e-5  # relative size of such a step after which the error is far below all noise
+_NEAR = 1e-6  # relative Newton step after which one more is exact to rounding
+_SECANTS = 20  # most quasi-Newton steps with one updated Jacobian
+_CLOSE = 1e-5  # relative quasi-Newton step at which the error is far below any noise
 
 
 class Secants(NamedTuple):
-    """A point, and the steps towards it: all that Broyden's method keeps of its updates.
+    """A point and the steps that led to it, which define Broyden's updates of the Jacobian.
 
     Reference: C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations (1995), section
     7.3, doi:10.1137/1.9781611970944.
@@ -35,7 +35,7 @@ class Secants(NamedTuple):
     taken: Int[Array, ""]
 
     def updated(self, move: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
-        """A step by the inverse Jacobian at the start, as one by that after all steps but one."""
+        """A step by the initial inverse Jacobian, corrected by the updates of all steps but one."""
 
         def update(k: Array, move: Array) -> Array:
             now, further = self.moves[k], self.moves[k + 1]
@@ -45,16 +45,16 @@ class Secants(NamedTuple):
 
 
 def start_of(point: Float[Array, " unknown"]) -> Secants:
-    """A point of whose neighbourhood nothing is known."""
+    """A starting point, without updates."""
     zero = batched_zero(point)
     return Secants(point, zero + jnp.zeros((_SECANTS, point.shape[0])), zero.astype(int))
 
 
 def batched_zero(point: Float[Array, " unknown"]) -> Float[Array, ""]:
-    """Zero, a number of every point.
+    """Zero, batched like the point.
 
-    A loop of many points whose first state is theirs throughout is traced once; else again and
-    again until it is known what is.
+    With a fully batched initial state a `vmap` of a loop is traced once; otherwise JAX traces it
+    repeatedly to find out what is batched.
     """
     return jnp.where(point[0] == 0, 0.0, 0.0)
 
@@ -64,8 +64,8 @@ def newton_solved(
 ) -> tuple[Float[Array, " unknown"], Float[Array, "unknown unknown"]]:
     """The solution of a problem's `equations` near `start`, and the Jacobian of its last step.
 
-    By Newton's method with the problem's `linearised`; NaN where it did not converge. The last step
-    is taken with what the equations depend on: it carries the derivatives.
+    By Newton's method with the problem's `linearised`; NaN if it did not converge. The last step is
+    differentiable and carries the derivatives, by the implicit function theorem.
     """
     fixed = jax.lax.stop_gradient(problem)
 
@@ -76,23 +76,23 @@ def newton_solved(
         return point - move, left, jacobian, count + 1, jnp.max(jnp.abs(move))
 
     def going(state: tuple) -> Array:
-        *_, count, size = state
-        return (count < 2) | ((count < 20) & (size > _NEAR))  # false for NaN
+        *_, count, change = state
+        return (count < 2) | ((count < 20) & (change > _NEAR))  # false for NaN
 
-    # The first step goes nowhere: the equations are then compiled once.
+    # The first step is zero, so that the equations are compiled only once.
     nothing, eye = jnp.zeros_like(start), jnp.eye(start.shape[0])
     first = (jax.lax.stop_gradient(start), nothing, eye, jnp.array(0), jnp.array(0.0))
-    point, _, jacobian, _, size = jax.lax.while_loop(going, step, first)
+    point, _, jacobian, _, change = jax.lax.while_loop(going, step, first)
     last = jnp.linalg.solve(jacobian, problem.equations(point))
     left = jnp.max(jnp.abs(jax.lax.stop_gradient(last)))
-    return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan), jacobian
+    return jnp.where((change <= _NEAR) & (left <= _NEAR), point - last, jnp.nan), jacobian
 
 
 class PrescribedMotion(eqx.Module):
-    """The equations of one state: its balance, and the fundamental prescribed at what was measured.
+    """The equations of one state: its balance, and its fundamental equal to the measured one.
 
-    A point holds the balance's scaled displacements and the cosine and the sine of the force over
-    `force`; phases are relative to the measured force.
+    A point holds the balance's scaled displacements and the cosine and sine parts of the force,
+    over `force`; phases are relative to the measured force.
     """
 
     balance: HarmonicBalance  # without a force
@@ -103,7 +103,7 @@ class PrescribedMotion(eqx.Module):
     sensor: int = eqx.field(static=True)
 
     def equations(self, point: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
-        """What is left of the balance and of the fundamental."""
+        """Residuals of the balance and of the fundamental."""
         residual = self.balance.residual(self._balance_point(point))
         return jnp.concatenate([residual - self._load(point[-2:]), self._miss(point)])
 
@@ -115,12 +115,12 @@ class PrescribedMotion(eqx.Module):
         return left, jnp.concatenate([wide, jax.jacrev(self._miss)(point)])
 
     def recorded(self, point: Float[Array, " unknown"]) -> tuple[Array, Array]:
-        """Complex force (N) and velocity (harmonic, sensor) that the instruments would record."""
+        """Complex force (N) and velocity (harmonic, sensor) as the instruments record them."""
         modes = simulated_structure(self.model).modes
         coefficients = self.balance.coefficients(self._balance_point(point))
         velocity = velocity_phasors(coefficients, self.frequency, modes.mode_shape)
         force = self.force * (point[-2] - 1j * point[-1])
-        # In phase with its own force, as the instruments see it.
+        # Phases relative to the actual force, as the instruments record them.
         order = jnp.arange(velocity.shape[0])[:, None]
         phase = force / jnp.abs(force)
         velocity = velocity * phase.conj() ** order
@@ -131,16 +131,18 @@ class PrescribedMotion(eqx.Module):
             per_force = modes.rigid_body_shape @ modes.rigid_body_participation
             rigid = -1j * jnp.abs(force) / self.frequency * fraction[:, None] * per_force
             velocity = velocity + rigid
-        size, seen = jnp.abs(force)[None], velocity[None]
+        amplitude, seen = jnp.abs(force)[None], velocity[None]
         modal = displacement_phasors(coefficients)[1, modes.mode_of_interest]
         for effect in self.model.measurement_effects:
-            size, seen = effect.recorded(self.frequency[None], size, seen, jnp.abs(modal)[None])
-        return size[0] * phase, seen[0] * phase**order
+            amplitude, seen = effect.recorded(
+                self.frequency[None], amplitude, seen, jnp.abs(modal)[None]
+            )
+        return amplitude[0] * phase, seen[0] * phase**order
 
     def solved(self, start: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
-        """The solution near `start` by Newton's method, NaN where it did not converge.
+        """The solution near `start` by Newton's method, NaN if it did not converge.
 
-        The last step is taken with what the equations depend on: it carries the derivatives.
+        The last step is differentiable and carries the derivatives.
         """
         return newton_solved(self, start)[0]
 
@@ -151,23 +153,23 @@ class PrescribedMotion(eqx.Module):
         close: Float[Array, ""],
         fraction: Float[Array, ""],
     ) -> Secants:
-        """The solution near a point, from an inverse Jacobian and what is known of it there.
+        """The solution near a point, from an inverse Jacobian and its updates there.
 
         Broyden's method: no step needs another Jacobian. It ends with a step below `close` or below
-        a share of the first one, and counts as a solution below 1e-5; else its point is NaN.
+        `fraction` of the first one, and has converged below 1e-5; else its point is NaN.
         """
-        place = jnp.arange(_SECANTS)
+        number = jnp.arange(_SECANTS)
 
         def step(state: tuple[Secants, Array, Array]) -> tuple[Secants, Array, Array]:
             now, _, enough = state
             move = now.updated(near.updated(-(inverse @ self.equations(now.point))))
             last = now.moves[jnp.maximum(now.taken - 1, 0)]
             back = last - move
-            length, size = last @ back, jnp.linalg.norm(last)
-            # What rounding makes of a step says nothing.
-            sure = jnp.abs(length) > 1e-3 * size * jnp.linalg.norm(back)
-            move = move * jnp.where(sure, size**2 / jnp.where(sure, length, 1.0), 1.0)
-            moves = jnp.where((place == now.taken)[:, None], move, now.moves)
+            projection, norm = last @ back, jnp.linalg.norm(last)
+            # No update from a step that is dominated by rounding.
+            sure = jnp.abs(projection) > 1e-3 * norm * jnp.linalg.norm(back)
+            move = move * jnp.where(sure, norm**2 / jnp.where(sure, projection, 1.0), 1.0)
+            moves = jnp.where((number == now.taken)[:, None], move, now.moves)
             far = jnp.max(jnp.abs(move))
             enough = jnp.where(now.taken == 0, jnp.clip(fraction * far, close, _CLOSE), enough)
             return Secants(now.point + move, moves, now.taken + 1), far, enough
@@ -178,18 +180,18 @@ class PrescribedMotion(eqx.Module):
 
         zero = batched_zero(near.point)
         first = (start_of(near.point), zero, zero)
-        found, far, _ = jax.lax.while_loop(going, step, first)
-        return found._replace(point=jnp.where(far <= _CLOSE, found.point, jnp.nan))
+        end, far, _ = jax.lax.while_loop(going, step, first)
+        return end._replace(point=jnp.where(far <= _CLOSE, end.point, jnp.nan))
 
     def grown(self) -> Float[Array, " unknown"]:
-        """The solution that grows from small amplitudes, as a start for `solved`; else NaN.
+        """The solution continued from small amplitude, as a start for `solved`; else NaN.
 
         Steps are halved where Newton's method fails.
         """
         return self.grown_with_jacobian()[0]
 
     def grown_with_jacobian(self) -> tuple[Array, Array]:
-        """The solution as `grown` finds it, and the equations' Jacobian at the last one found."""
+        """The solution of `grown`, and the equations' Jacobian at the last converged one."""
         fixed = jax.lax.stop_gradient(self)
         first = jnp.zeros(self.balance.size + 2).at[-2].set(_SMALL)
 
@@ -216,23 +218,25 @@ class PrescribedMotion(eqx.Module):
         return jnp.append(point[:-2], self.frequency / self.balance.frequency_scale)
 
     def _load(self, parts: Float[Array, " part"]) -> Float[Array, " equation"]:
-        """Scaled load of a force with this cosine and sine.
+        """Scaled load of a force with these cosine and sine parts.
 
-        Another phase turns its harmonics h times as far.
+        A phase of the fundamental is h times as large for harmonic h.
         """
         rows = self.balance.load().reshape(self.balance.n_coefficients, -1)
-        one = rows[1::2] - 1j * rows[2::2]  # of one newton in phase; it acts with phases of its own
+        one = rows[1::2] - 1j * rows[2::2]  # of one newton with phase zero
         phasor = self.force * (parts[0] - 1j * parts[1])
-        there = jnp.where(phasor != 0, phasor, 1.0)
-        turned = phasor * jnp.exp(1j * jnp.angle(there) * jnp.arange(self.balance.harmonic_order))
-        each = turned[:, None] * one
+        nonzero = jnp.where(phasor != 0, phasor, 1.0)
+        rotated = phasor * jnp.exp(
+            1j * jnp.angle(nonzero) * jnp.arange(self.balance.harmonic_order)
+        )
+        each = rotated[:, None] * one
         oscillating = jnp.stack([each.real, -each.imag], axis=1).reshape(-1)
-        return jnp.concatenate([jnp.abs(there) * rows[0], oscillating])
+        return jnp.concatenate([jnp.abs(nonzero) * rows[0], oscillating])
 
     def _miss(self, point: Array) -> Float[Array, " part"]:
         velocity = self.recorded(point)[1][1, self.sensor]
-        size = jax.lax.stop_gradient(jnp.abs(self.velocity))
-        miss = (velocity - self.velocity) / size
+        scale = jax.lax.stop_gradient(jnp.abs(self.velocity))
+        miss = (velocity - self.velocity) / scale
         return jnp.stack([miss.real, miss.imag])
 
 
@@ -248,8 +252,8 @@ def prescribed_motion(
 ) -> PrescribedMotion:
     """The equations of a motion with a given fundamental at one sensor.
 
-    Arguments: `frequency` in rad/s; `force` in N only scales; `velocity` as it is recorded, in
-    m/s; `scale` a typical velocity in m/s, for a point to mean the same when `velocity` changes.
+    Arguments: `frequency` in rad/s; `force` in N, a scale; `velocity` as recorded, in m/s; `scale`
+    a typical velocity in m/s, which fixes the units of a point when `velocity` changes.
     """
     shape = model.modes.mode_shape[sensor, model.modes.mode_of_interest]
     displacement = jax.lax.stop_gradient(jnp.abs(scale / (frequency * shape)))

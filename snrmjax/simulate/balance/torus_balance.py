@@ -1,7 +1,7 @@
 """Harmonic balance in two frequencies: quasi-periodic motions as functions of two phases.
 
 q(τ₁, τ₂) with τ₁ = Ωt of the force and τ₂ = ωt of the motion's own slow frequency: a Fourier series
-in cos(k₁τ₁ + k₂τ₂) and its sine, with k₁ up to H in size and k₂ up to K.
+in cos(k₁τ₁ + k₂τ₂) and its sine, with |k₁| up to H and k₂ up to K.
 """
 
 from functools import lru_cache
@@ -29,9 +29,9 @@ class TorusBasis(NamedTuple):
 
 @lru_cache(maxsize=8)
 def torus_basis(fast_order: int, slow_order: int, n_fast: int, n_slow: int) -> TorusBasis:
-    """The basis of so many harmonics with so many samples over each phase.
+    """The basis of these harmonic orders and numbers of samples over each phase.
 
-    The coefficients of k₂ = 0 come first, in the order of a periodic motion's.
+    The coefficients of k₂ = 0 come first, ordered as those of a periodic motion.
     """
     pairs = [(k, 0) for k in range(1, fast_order + 1)]
     for slow in range(1, slow_order + 1):
@@ -45,19 +45,19 @@ def torus_basis(fast_order: int, slow_order: int, n_fast: int, n_slow: int) -> T
     synthesis[:, 1::2], synthesis[:, 2::2] = np.cos(angle), np.sin(angle)
     analysis = synthesis.T * (2.0 / first.size)
     analysis[0] *= 0.5
-    turn = np.zeros((2, size, size))
+    derivative = np.zeros((2, size, size))
     cosines = np.arange(1, size, 2)
-    for part, order in zip(turn, (fast, slow), strict=True):
+    for part, order in zip(derivative, (fast, slow), strict=True):
         part[cosines, cosines + 1], part[cosines + 1, cosines] = order[::2], -order[::2]
     k_fast, k_slow = (np.concatenate([[0], order]) for order in (fast, slow))
-    return TorusBasis(k_fast, k_slow, synthesis, analysis, turn[0], turn[1])
+    return TorusBasis(k_fast, k_slow, synthesis, analysis, derivative[0], derivative[1])
 
 
 class TorusBalance(eqx.Module):
     """The balance R(x, ω, Ω) = 0 of quasi-periodic motions under one force.
 
     A point holds the scaled (coefficient, mode) displacements, then ω and Ω over the scale of
-    frequencies. The last equation fixes where τ₂ begins: `phase` · x = 0.
+    frequencies. The last equation is the phase condition of τ₂: `phase` · x = 0.
     """
 
     balance: HarmonicBalance  # of the periodic motions
@@ -108,12 +108,12 @@ class TorusBalance(eqx.Module):
         by_x = by_x + jnp.einsum("cd,cm,mn->cmdn", eye, own, diagonal)
         by_x = by_x + jnp.einsum("cd,mn->cmdn", rate, terms.damping_matrix() / fs)
 
-        def by_frequency(turn: np.ndarray, orders: np.ndarray) -> Float[Array, " equation"]:
-            change = jnp.asarray(turn) @ x
-            there = synthesis @ (scale * change)
-            pulled = basis.analysis @ (jnp.einsum("tmn,tn->tm", c, there) * fs / unit)
+        def by_frequency(derivative: np.ndarray, orders: np.ndarray) -> Float[Array, " equation"]:
+            change = jnp.asarray(derivative) @ x
+            rate_change = synthesis @ (scale * change)
+            nonlinear = basis.analysis @ (jnp.einsum("tmn,tn->tm", c, rate_change) * fs / unit)
             inertia = -2 * (order * orders)[:, None] * terms.mass * x
-            return (terms.damped(change) / fs + pulled + inertia).reshape(-1)
+            return (terms.damped(change) / fs + nonlinear + inertia).reshape(-1)
 
         columns = [
             by_frequency(basis.by_slow, basis.slow),

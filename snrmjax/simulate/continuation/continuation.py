@@ -1,4 +1,4 @@
-"""Pseudo-arclength continuation of curves of solutions, with steps chosen by curvature."""
+"""Pseudo-arclength continuation of solution curves with curvature-controlled steps."""
 
 from enum import StrEnum
 from typing import NamedTuple
@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from snrmjax.numerics.status import Status
 from snrmjax.simulate.continuation.newton import Linearised, Number, Point, Trial
 
-_FARTHEST = 3.0  # steps over the last one, beyond which the cubic is no guess
-_FIRST, _ORDINARY, _TO_END = 0, 1, 2  # what a trial is for
+_FARTHEST = 3.0  # largest step over the last one at which the cubic predictor is used
+_FIRST, _ORDINARY, _TO_END = 0, 1, 2  # the aim of a trial
 RUNNING = -1  # the status of a curve that has not ended
 
 
@@ -45,33 +45,33 @@ class CurveStatus(Status):
 
 
 class StepControl(eqx.Module):
-    """How a curve is traced: step sizes in the scaled unknowns (order one), and what they pass.
+    """How a curve is traced: step lengths in the scaled unknowns (order one) and tolerances.
 
-    A step is accepted when Newton's method converges to a point near the guess, where the curve
-    has turned little; it is halved otherwise. All but the two whole numbers may change without
-    another compilation. Raises `ValueError` for fewer than two points.
+    A step is accepted when Newton's method converges to a point near the prediction and the
+    tangent has rotated little; it is halved otherwise. All but the two integers may change without
+    recompilation. Raises `ValueError` for fewer than two points.
     """
 
     first: Number = 0.01
     smallest: Number = 1e-7
     largest: Number = 0.05
-    angle: Number = 0.1  # rad, aimed at between neighbouring tangents
-    tolerance: Number = 1e-9  # on the error that is left after the last Newton step
-    nonsmooth_point: Number = (
-        2e-4  # steps below it may turn sharply: a kinked force bends the curve
+    angle: Number = 0.1  # rad, target between neighbouring tangents
+    tolerance: Number = 1e-9  # of the error remaining after the last Newton step
+    corner_step: Number = (
+        2e-4  # shorter steps may pass a corner: of the curve, by a nonsmooth force
     )
-    # Guesses are cubic, so a solution farther from one than a third of the step is on another
+    # The predictor is cubic, so a solution farther from it than a third of the step is on another
     # part of the curve, or on another curve.
-    largest_miss: Number = 0.3  # distance of the solution from the guess, over the step
-    nonsmooth_miss: Number = (
-        2.0  # the same for steps below `nonsmooth_point`, where the cubic says nothing
+    largest_miss: Number = 0.3  # distance of the solution from the prediction, over the step
+    corner_miss: Number = (
+        2.0  # the same for steps below `corner_step`, where no cubic predicts the curve
     )
     largest_turn: Number = 3.0  # between neighbouring tangents, over `angle`
-    # A harmonic that turns its sign within a step has jumped from one flank of a light damped
+    # A harmonic that changes sign within a step has jumped from one flank of a lightly damped
     # resonance to the other: it changes by twice its norm, on a smooth curve by less than one.
     largest_change: Number = 0.9  # of one harmonic in a step, over its norm
-    slight: Number = 0.05  # harmonics below this share of the motion may change as they like
-    closing: Number = 0.2  # a closed curve passes its first point nearer than this share of a step
+    slight: Number = 0.05  # harmonics below this fraction of the motion may change freely
+    closing: Number = 0.2  # a closed curve passes its first point within this fraction of a step
     iterations: int = eqx.field(static=True, default=8)  # of Newton's method, at most
     max_points: int = eqx.field(static=True, default=4000)
 
@@ -79,19 +79,17 @@ class StepControl(eqx.Module):
         if self.max_points < 2:
             raise ValueError(f"`max_points` must be 2 or more, but is {self.max_points}.")
 
-    def is_near(self, step: Array, miss: Array, turn: Array) -> Bool[Array, ""]:
-        """Whether a point is so near its guess that it is the next of the curve."""
-        smooth = (miss < self.largest_miss * step) & (turn < self.largest_turn * self.angle)
-        nonsmooth = (
-            (step < self.nonsmooth_point)
-            & (turn < 0.5 * jnp.pi)
-            & (miss < self.nonsmooth_miss * step)
+    def is_near(self, step: Array, miss: Array, rotation: Array) -> Bool[Array, ""]:
+        """Whether a point is near enough to its prediction to be the next one of the curve."""
+        smooth = (miss < self.largest_miss * step) & (rotation < self.largest_turn * self.angle)
+        corner = (
+            (step < self.corner_step) & (rotation < 0.5 * jnp.pi) & (miss < self.corner_miss * step)
         )
-        return smooth | nonsmooth
+        return smooth | corner
 
-    def growth(self, turn: Array, n_solves: Array, good: Array) -> Float[Array, ""]:
-        """The next step over the last one, after a turn of the tangent (rad)."""
-        factor = jnp.clip(self.angle / jnp.maximum(turn, 1e-3), 0.5, 2.0)
+    def growth(self, rotation: Array, n_solves: Array, good: Array) -> Float[Array, ""]:
+        """The next step over the last one, given the rotation of the tangent (rad)."""
+        factor = jnp.clip(self.angle / jnp.maximum(rotation, 1e-3), 0.5, 2.0)
         factor = jnp.where(n_solves >= 4, jnp.minimum(factor, 0.7), factor)
         return jnp.where(good, factor, 0.5)
 
@@ -111,11 +109,11 @@ class Curve(NamedTuple):
     tangents: Float[Array, "point unknown"]
     n_points: Int[Array, ""]
     status: Int[Array, ""]
-    n_solves: Int[Array, ""]  # linear systems factorised on the way
+    n_solves: Int[Array, ""]  # linear systems factorised
 
 
 class CurveEvent(StrEnum):
-    """What happens at a point of a curve, `NONE` at most of them."""
+    """Event at a point of a curve; `NONE` at most of them."""
 
     NONE = ""
     FOLD = "fold"
@@ -127,14 +125,14 @@ class CurveEvent(StrEnum):
 
 
 class TracedCurve(NamedTuple):
-    """Points along one curve and what was found at them, on the host."""
+    """Points along one curve, with events and multipliers, on the host."""
 
     points: Float[np.ndarray, "point unknown"]
     tangents: Float[np.ndarray, "point unknown"]
     status: CurveStatus = CurveStatus.UPPER_END
     n_solves: int = 0
-    events: tuple[CurveEvent, ...] = ()  # at the points; none before they were looked for
-    not_located: tuple[str, ...] = ()  # kinds of the events whose place was not found
+    events: tuple[CurveEvent, ...] = ()  # at the points; empty before the search for events
+    not_located: tuple[str, ...] = ()  # kinds of events that could not be located
     multipliers: Complex[np.ndarray, "point multiplier"] | None = None
 
     def reversed(self) -> "TracedCurve":
@@ -154,10 +152,10 @@ def on_host(curve: Curve) -> TracedCurve:
 
 
 class Tracing(NamedTuple):
-    """A curve that is being traced: where it is, where it came from, and the trial under way."""
+    """State of a continuation: current, last and first points with tangents, and the trial."""
 
     here: Point
-    tangent: Point  # at first which way to go
+    tangent: Point  # at first the direction of tracing
     back: Point
     back_tangent: Point
     origin: Point
@@ -165,25 +163,25 @@ class Tracing(NamedTuple):
     trial: Trial
     n_points: Int[Array, ""]
     step: Float[Array, ""]
-    aim: Int[Array, ""]  # what the trial is for
+    aim: Int[Array, ""]  # of the trial
     status: Int[Array, ""]  # of a `CurveStatus`, or RUNNING
     n_solves: Int[Array, ""]
 
 
 class CurveTracer(eqx.Module):
-    """How a curve R(x, λ) = 0 is walked along, one trial after the other.
+    """Pseudo-arclength continuation of a curve R(x, λ) = 0, one trial after the other.
 
-    `linearised` gives R and its Jacobian, `within` says where the curve ends. The next point is
-    guessed by the cubic through the last two points and their tangents. A step is halved when
-    Newton's method fails, when it ends far from the guess, or when the tangent turns by too much
-    (but at a nonsmooth event, which steps below `control.nonsmooth_point` may pass); otherwise it
-    is chosen so that the next turn comes near `control.angle`.
-    With `groups` = (rows, columns), into which the first unknowns unfold, no column may change by
-    more than `control.largest_change` of its norm in a step: across a light damped resonance the
-    response turns its sign, and on the scale of the peak the two flanks far below it are
+    `linearised` returns R and its Jacobian, `within` is the range. The predictor is the cubic
+    through the last two points and their tangents. A step is halved when Newton's method fails,
+    converges far from the prediction, or the tangent rotates too much (but for steps below
+    `control.corner_step`, which may pass a nonsmooth event); otherwise its length is chosen so
+    that the next rotation is about `control.angle`.
+    With `groups` = (rows, columns), the shape of the first unknowns as a matrix, no column may
+    change by more than `control.largest_change` of its norm in a step: across a lightly damped
+    resonance the response changes sign, and on the scale of the peak its two flanks are close
     neighbours.
-    The last point of a curve that left the range lies on its end; that of a closed one is the
-    first again (a curve that begins at an end of its range does not close: `may_close`).
+    The last point of a curve that leaves the range lies on its end; that of a closed one repeats
+    the first (a curve that begins at an end of its range does not close: `may_close`).
     """
 
     linearised: Linearised
@@ -192,8 +190,8 @@ class CurveTracer(eqx.Module):
     groups: tuple[int, int] | None = eqx.field(static=True, default=None)
     may_close: bool = eqx.field(static=True, default=True)
 
-    def begun(self, start: Point, direction: Point, across: Point | None = None) -> Tracing:
-        """Before the first point: `start` is a guess of it, corrected at its own λ or `across`."""
+    def initial(self, start: Point, direction: Point, across: Point | None = None) -> Tracing:
+        """The initial state: `start` is a guess, corrected at its own λ or across `across`."""
         unset = jnp.array(0)
         return Tracing(
             *(start, direction, start, direction, start, direction),
@@ -205,36 +203,36 @@ class CurveTracer(eqx.Module):
             n_solves=unset,
         )
 
-    def patience(self, walk: Tracing) -> Int[Array, ""]:
-        """Steps that Newton's method has for the trial under way."""
+    def patience(self, state: Tracing) -> Int[Array, ""]:
+        """Most Newton steps of the current trial."""
         usual = self.control.iterations
-        return jnp.where(walk.aim == _ORDINARY, usual, 5 * usual)
+        return jnp.where(state.aim == _ORDINARY, usual, 5 * usual)
 
-    def advanced(self, walk: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
-        """After one step of Newton's method, and whether `here` is a new point of the curve."""
-        trial = walk.trial.stepped(self.linearised, self.control.tolerance)
-        going = trial.goes_on(self.patience(walk))
-        unjudged = walk._replace(trial=trial), jnp.array(False)
-        return jax.lax.cond(going, lambda: unjudged, lambda: self.judged(unjudged[0]))
+    def advanced(self, state: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
+        """The state after one Newton step, and whether `here` is a new point of the curve."""
+        trial = state.trial.stepped(self.linearised, self.control.tolerance)
+        going = trial.goes_on(self.patience(state))
+        pending = state._replace(trial=trial), jnp.array(False)
+        return jax.lax.cond(going, lambda: pending, lambda: self.assessed(pending[0]))
 
-    def corrected(self, walk: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
-        """After the whole trial under way, and whether `here` is a new point of the curve."""
-        patience, tolerance = self.patience(walk), self.control.tolerance
+    def corrected(self, state: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
+        """The state after the whole trial, and whether `here` is a new point of the curve."""
+        patience, tolerance = self.patience(state), self.control.tolerance
         trial = jax.lax.while_loop(
             lambda trial: trial.goes_on(patience),
             lambda trial: trial.stepped(self.linearised, tolerance),
-            walk.trial,
+            state.trial,
         )
-        return self.judged(walk._replace(trial=trial))
+        return self.assessed(state._replace(trial=trial))
 
-    def judged(self, walk: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
-        """After a trial that has ended, with the next one begun; and whether it gave a point."""
-        control, trial, (lower, upper, _) = self.control, walk.trial, self.within
-        here, tangent, new = walk.here, walk.tangent, trial.point
-        is_first, is_end = walk.aim == _FIRST, walk.aim == _TO_END
+    def assessed(self, state: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
+        """Accept or reject a finished trial and start the next; and whether it gave a point."""
+        control, trial, (lower, upper, _) = self.control, state.trial, self.within
+        here, tangent, new = state.here, state.tangent, trial.point
+        is_first, is_end = state.aim == _FIRST, state.aim == _TO_END
         new_tangent = trial.tangent * jnp.where(trial.tangent @ tangent < 0, -1.0, 1.0)
-        turn = jnp.arccos(jnp.clip(new_tangent @ tangent, -1.0, 1.0))
-        near = control.is_near(walk.step, jnp.linalg.norm(new - trial.start), turn)
+        rotation = jnp.arccos(jnp.clip(new_tangent @ tangent, -1.0, 1.0))
+        near = control.is_near(state.step, jnp.linalg.norm(new - trial.start), rotation)
         near &= _steady(here, new, self.groups, control)
         good = trial.converged & (is_first | is_end | near)
 
@@ -246,32 +244,32 @@ class CurveTracer(eqx.Module):
 
         closed = jnp.array(False)
         if self.may_close:
-            passed = _passes(walk, new, new_tangent, control.closing)
-            closed = good & (walk.n_points > 4) & passed
-            new = jnp.where(closed, walk.origin, new)
-            walk = walk._replace(
-                origin=jnp.where(is_first, new, walk.origin),
-                origin_tangent=jnp.where(is_first, new_tangent, walk.origin_tangent),
+            passed = _passes(state, new, new_tangent, control.closing)
+            closed = good & (state.n_points > 4) & passed
+            new = jnp.where(closed, state.origin, new)
+            state = state._replace(
+                origin=jnp.where(is_first, new, state.origin),
+                origin_tangent=jnp.where(is_first, new_tangent, state.origin_tangent),
             )
         kept = good & ~leaving
-        n_points = walk.n_points + kept
+        n_points = state.n_points + kept
         longer = jnp.minimum(
-            walk.step * control.growth(turn, trial.n_solves, good), control.largest
+            state.step * control.growth(rotation, trial.n_solves, good), control.largest
         )
-        step = jnp.where(is_first | leaving, walk.step, longer)
+        step = jnp.where(is_first | leaving, state.step, longer)
         status = self._status(
-            walk, new, good=good, kept=kept, closed=closed, n_points=n_points, step=step
+            state, new, good=good, kept=kept, closed=closed, n_points=n_points, step=step
         )
-        onward = walk._replace(
+        onward = state._replace(
             here=jnp.where(kept, new, here),
             tangent=jnp.where(kept, new_tangent, tangent),
-            back=jnp.where(kept, here, walk.back),
-            back_tangent=jnp.where(kept, tangent, walk.back_tangent),
+            back=jnp.where(kept, here, state.back),
+            back_tangent=jnp.where(kept, tangent, state.back_tangent),
             n_points=n_points,
             step=step,
             aim=jnp.where(leaving, _TO_END, _ORDINARY),
             status=status,
-            n_solves=walk.n_solves + trial.n_solves,
+            n_solves=state.n_solves + trial.n_solves,
         )
         guess = jnp.where(leaving, to_end, _extrapolated(onward))
         across = jnp.where(leaving, _at_lambda(guess), onward.tangent)
@@ -279,7 +277,7 @@ class CurveTracer(eqx.Module):
 
     def _status(
         self,
-        walk: Tracing,
+        state: Tracing,
         new: Point,
         *,
         good: Array,
@@ -290,7 +288,7 @@ class CurveTracer(eqx.Module):
     ) -> Int[Array, ""]:
         """Whether and how the curve has ended."""
         lower, upper, largest_amplitude = self.within
-        is_first, is_end = walk.aim == _FIRST, walk.aim == _TO_END
+        is_first, is_end = state.aim == _FIRST, state.aim == _TO_END
         large = jnp.array(False)
         if largest_amplitude is not None:
             large = jnp.max(jnp.abs(new[:-1])) > largest_amplitude
@@ -319,32 +317,32 @@ def trace_curve(
     start_across: Point | None = None,
     groups: tuple[int, int] | None = None,
 ) -> Curve:
-    """Trace the curve R(x, λ) = 0 from `start` until λ leaves its range, as `CurveTracer` says.
+    """Trace the curve R(x, λ) = 0 from `start` until λ leaves its range, by `CurveTracer`.
 
-    Arguments: `linearised` gives R and its Jacobian; `start` is a guess of the first point,
-    corrected at its own λ, or across `start_across`; `direction` says which way to go.
+    Arguments: `linearised` returns R and its Jacobian; `start` is a guess of the first point,
+    corrected at its own λ, or across `start_across`; `direction` is that of tracing.
     Reference: Seydel, Practical Bifurcation and Stability Analysis (2010), chapter 4,
     doi:10.1007/978-1-4419-1740-9.
     """
-    walker = CurveTracer(linearised, within, control, groups)
+    tracer = CurveTracer(linearised, within, control, groups)
 
-    def body(state: tuple) -> tuple:
-        walk, points, tangents = state
-        place = walk.n_points
-        walk, kept = walker.corrected(walk)
-        # Rows are only written here, never read, so that the loop need not copy them; a row that
-        # is not kept is written again later, or is beyond the last.
-        points = points.at[place].set(jnp.where(kept, walk.here, jnp.nan))
-        tangents = tangents.at[place].set(jnp.where(kept, walk.tangent, jnp.nan))
-        return walk, points, tangents
+    def body(carry: tuple) -> tuple:
+        state, points, tangents = carry
+        index = state.n_points
+        state, kept = tracer.corrected(state)
+        # Rows are only written here, never read, so that the loop need not copy them; a rejected
+        # row is overwritten later, or lies beyond the last.
+        points = points.at[index].set(jnp.where(kept, state.here, jnp.nan))
+        tangents = tangents.at[index].set(jnp.where(kept, state.tangent, jnp.nan))
+        return state, points, tangents
 
     unset = jnp.full((control.max_points, start.shape[0]), jnp.nan)
-    walk, points, tangents = jax.lax.while_loop(
-        lambda state: state[0].status == RUNNING,
+    state, points, tangents = jax.lax.while_loop(
+        lambda carry: carry[0].status == RUNNING,
         body,
-        (walker.begun(start, direction, start_across), unset, unset),
+        (tracer.initial(start, direction, start_across), unset, unset),
     )
-    return Curve(points, tangents, walk.n_points, walk.status, walk.n_solves)
+    return Curve(points, tangents, state.n_points, state.status, state.n_solves)
 
 
 def _at_lambda(point: Point) -> Point:
@@ -352,14 +350,14 @@ def _at_lambda(point: Point) -> Point:
     return jnp.zeros_like(point).at[-1].set(1.0)
 
 
-def _passes(walk: Tracing, new: Point, new_tangent: Point, closing: Number) -> Bool[Array, ""]:
+def _passes(state: Tracing, new: Point, new_tangent: Point, closing: Number) -> Bool[Array, ""]:
     """Whether the curve passes its first point between `here` and `new`, in the same direction."""
-    here, tangent, origin = walk.here, walk.tangent, walk.origin
+    here, tangent, origin = state.here, state.tangent, state.origin
     to_origin, to_new = tangent @ (origin - here), tangent @ (new - here)
     passed = (to_origin > 0) & (to_origin <= to_new)
     passed &= jnp.linalg.norm(origin - here) <= 2.0 * to_origin
-    passed &= new_tangent @ walk.origin_tangent > 0.5
-    # A point that only happens to lie on the way has others where the curve passes it.
+    passed &= new_tangent @ state.origin_tangent > 0.5
+    # A point ahead by chance alone is not near the chord from `here` to `new`.
     nearest = here + to_origin / jnp.maximum(to_new, 1e-300) * (new - here)
     return passed & (jnp.linalg.norm(nearest - origin) < closing * jnp.linalg.norm(new - here))
 
@@ -367,7 +365,7 @@ def _passes(walk: Tracing, new: Point, new_tangent: Point, closing: Number) -> B
 def _steady(
     here: Point, new: Point, groups: tuple[int, int] | None, control: StepControl
 ) -> Bool[Array, ""]:
-    """Whether no column of the unknowns changes by most of itself."""
+    """Whether no column of the unknowns changes by most of its norm."""
     if groups is None:
         return jnp.array(True)
     rows, columns = groups
@@ -378,16 +376,16 @@ def _steady(
     return jnp.all((norms[2] <= control.largest_change * largest) | (largest <= slight))
 
 
-def _extrapolated(walk: Tracing) -> Point:
-    """Where the cubic through the last two points and their tangents is, a step farther."""
-    here, tangent, step = walk.here, walk.tangent, walk.step
-    known = walk.n_points >= 2
-    gap = jnp.where(known, jnp.linalg.norm(here - walk.back), 1.0)
+def _extrapolated(state: Tracing) -> Point:
+    """Predictor: the cubic through the last two points and their tangents, a step ahead."""
+    here, tangent, step = state.here, state.tangent, state.step
+    known = state.n_points >= 2
+    gap = jnp.where(known, jnp.linalg.norm(here - state.back), 1.0)
     fraction = jnp.where(known, step / gap, 0.0)
-    chord = (here - walk.back) / gap
+    chord = (here - state.back) / gap
     # here + step·t + (step²)·a + (step² · (step + gap))·b, from Hermite's divided differences.
     second = (tangent - chord) / gap
-    third = (tangent - 2 * chord + walk.back_tangent) / gap**2
-    bend = step**2 * (second + (step + gap) * third)
+    third = (tangent - 2 * chord + state.back_tangent) / gap**2
+    curvature = step**2 * (second + (step + gap) * third)
     trusted = known & (fraction < _FARTHEST)
-    return here + step * tangent + jnp.where(trusted, bend, 0.0)
+    return here + step * tangent + jnp.where(trusted, curvature, 0.0)

@@ -1,4 +1,4 @@
-"""Many response curves of one kind: stacked balances, starts, and their walks side by side."""
+"""Batches of response curves: stacked balances, starts, and their continuation in parallel."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -32,13 +32,13 @@ from snrmjax.simulate.continuation.continuation import (
     Tracing,
 )
 
-# From an end of the range, over a force that rises from zero to its value or past it, or through
-# a point.
+# From an end of the range; over a force that rises from zero to its value, or past it; or through
+# a given point.
 _Way = Literal["from_end", "rising", "past", "through"]
-_RISING_POINTS = 300  # over the force: what is longer winds around and comes to no other motion
-_PAST = 4.0  # times the force: motions that begin at a larger one come back to it
+_RISING_POINTS = 300  # over the force: longer curves wind around without reaching another motion
+_PAST = 4.0  # times the force, up to which a rising force is continued
 _NEAR = 5e-3  # distance in scaled unknowns below which a motion lies on a known curve
-_ALONE = 512  # points of a single curve before the host sees them
+_ALONE = 512  # points of a single curve in one call of the program
 
 
 def response_balances(
@@ -50,13 +50,13 @@ def response_balances(
 ) -> HarmonicBalance:
     """The balances of all members under their forces (N), stacked.
 
-    Their scales are those of the modes that move `within` two frequencies (rad/s).
+    Their scales are those of the resonant modes `within` two frequencies (rad/s).
     """
     together, every = stacked(models), list(zip(models, forces, strict=True))
     scales = [resonance_displacement(m, float(f), within) for m, f in every]
     first = [resonant_modes(m, within)[:1] or [m.modes.mode_of_interest] for m in models]
     natural = np.asarray(together.modes.natural_frequency)
-    # On the host: on the device another number of members would compile anew.
+    # On the host: on the device another number of members would recompile.
     columns: dict[str, Any] = {
         "force": np.asarray(forces),
         "displacement_scale": np.asarray(scales),
@@ -80,13 +80,13 @@ def trace_from_rest(
     downward: bool,
     starts: Float[np.ndarray, "member unknown"] | None = None,
 ) -> list[TracedCurve]:
-    """The curves of the members `index` from an end of the range (rad/s), so many side by side.
+    """The curves of the members `index` from an end of the range (rad/s), `lanes` at a time.
 
-    From the scaled `starts` (NaN leads nowhere), by default from the linear response.
+    From the scaled `starts` (NaN gives no curve), by default from the linear response.
     """
     if not len(index):
         return []
-    return _walked(taken(balances, index), ends, steps, starts, lanes, downward=downward)
+    return _traced(taken(balances, index), ends, steps, starts, lanes, downward=downward)
 
 
 def under_rising_force(
@@ -98,20 +98,20 @@ def under_rising_force(
     *,
     rest: Float[np.ndarray, "member mode"] | None = None,
 ) -> Float[np.ndarray, "member unknown"]:
-    """Where motions of the members `index` arrive as the force rises from zero, scaled.
+    """Motions of the members `index` reached by raising the force from zero, scaled.
 
     At the frequency `end` (rad/s), from the equilibria at `rest` (kg^1/2 m), by default from zero.
-    NaN where the curve over the force turns back to none.
+    NaN where the curve over the force folds back to zero.
     """
     mine = taken(balances, index)
     starts = np.full((len(index), balances.size + 1), np.nan)
     if not len(index):
         return starts
-    begins = np.zeros_like(starts)
+    initial = np.zeros_like(starts)
     if rest is not None:  # the mean comes first among the coefficients
-        begins[:, : rest.shape[1]] = rest / np.asarray(mine.displacement_scale)[:, None]
+        initial[:, : rest.shape[1]] = rest / np.asarray(mine.displacement_scale)[:, None]
     at, steps = np.array([end, end]), _over_force(steps)
-    risen = _walked(mine, at, steps, begins, lanes, downward=False, way="rising")
+    risen = _traced(mine, at, steps, initial, lanes, downward=False, way="rising")
     for start, curve in zip(starts, risen, strict=True):
         if curve.status == CurveStatus.UPPER_END:
             start[:-1] = curve.points[-1, :-1]
@@ -126,15 +126,15 @@ def motions_at(
     steps: StepControl,
     lanes: int,
 ) -> Float[np.ndarray, "member unknown"]:
-    """What Newton's method finds at a frequency (rad/s) from rest, scaled; NaN where nothing."""
+    """Solutions of Newton's method from rest at a frequency (rad/s), scaled; NaN if none."""
     starts = np.zeros((len(index), balances.size + 1))
     starts[:, -1] = end / np.asarray(balances.frequency_scale)[index]
     one = dataclasses.replace(steps, max_points=2)
-    found = trace_from_rest(
+    curves = trace_from_rest(
         *(balances, index, np.array([end, end]), one, lanes), downward=False, starts=starts
     )
     nothing = np.full(balances.size + 1, np.nan)
-    return np.array([one.points[0] if len(one.points) else nothing for one in found]).reshape(
+    return np.array([one.points[0] if len(one.points) else nothing for one in curves]).reshape(
         starts.shape
     )
 
@@ -148,12 +148,12 @@ def at_force(
 ) -> Float[np.ndarray, "motion unknown"]:
     """Motions of one member at a frequency (rad/s) that a rising force connects with rest, scaled.
 
-    The force goes to several times its value and back around its folds: every passing of its value
-    is one. They lie between two points of a curve and are not corrected.
+    The curve is traced over the force to several times its value and around its folds; every
+    crossing of its value is a motion, interpolated between two points and not corrected.
     """
     mine = taken(balances, np.array([member]))
     at, begin = np.array([frequency, frequency]), np.zeros((1, balances.size + 1))
-    (curve,) = _walked(mine, at, _over_force(steps), begin, lanes, downward=False, way="past")
+    (curve,) = _traced(mine, at, _over_force(steps), begin, lanes, downward=False, way="past")
     beyond = curve.points[:, -1] > 1
     k = np.flatnonzero(beyond[1:] != beyond[:-1])
     here, there = curve.points[k], curve.points[k + 1]
@@ -169,7 +169,7 @@ def trace_both_ways(
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
 ) -> TracedCurve:
-    """The curve through a point of a single member: once around, or from one end to the other."""
+    """The curve through a point of a single member: closed, or from one end to the other."""
     ways = []
     for downward in (False, True):
         way = trace_through(balances, ends, steps, downward=downward, starts=point[None])[0]
@@ -212,10 +212,10 @@ def trace_through(
 ) -> list[TracedCurve]:
     """Curves through given scaled points, towards one end of the range (rad/s)."""
     starts = np.asarray(starts)
-    return _walked(balances, ends, steps, starts, 1, downward=downward, way="through")
+    return _traced(balances, ends, steps, starts, 1, downward=downward, way="through")
 
 
-def _walked(
+def _traced(
     balances: HarmonicBalance,
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
@@ -226,16 +226,16 @@ def _walked(
     way: _Way = "from_end",
 ) -> list[TracedCurve]:
     """Curves from given starts, or from the linear response; or over a rising force."""
-    walk = (np.asarray(ends), steps, np.array(downward))
+    common = (np.asarray(ends), steps, np.array(downward))
     further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, TOGETHER)
 
-    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> StateRows:
-        return _begun(jobs, wanted, *walk, way=way)
+    def initial(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> StateRows:
+        return _initial(jobs, wanted, *common, way=way)
 
-    def advanced(jobs: tuple, walks: StateRows, idle: int) -> tuple:
-        return further(jobs, walks, *walk, np.array(idle), way=way, length=length)
+    def advanced(jobs: tuple, states: StateRows, idle: int) -> tuple:
+        return further(jobs, states, *common, np.array(idle), way=way, length=length)
 
-    (status, n_solves), rows = in_lanes(begun, advanced, (balances, starts), lanes)
+    (status, n_solves), rows = in_lanes(initial, advanced, (balances, starts), lanes)
     curves = []
     for k, given in enumerate(rows):
         points, tangents = given or (np.zeros((0, balances.size + 1)),) * 2
@@ -244,7 +244,7 @@ def _walked(
 
 
 def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way) -> CurveTracer:
-    """Along the response, or along that at the lower end to a force that rises from zero."""
+    """Along the response, or at the lower end of the range over a rising force."""
     lower, upper = ends / balance.frequency_scale
     if way not in ("rising", "past"):
         groups, closes = (balance.n_coefficients, balance.model.n_modes), way == "through"
@@ -252,7 +252,7 @@ def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way
     load = balance.newtons(lower) * balance.load()
 
     def linearised(point: Array) -> tuple[Array, Array]:
-        """Unknowns x and the share of the force."""
+        """Unknowns x and the fraction of the force."""
         now = eqx.tree_at(lambda b: b.force, balance, balance.force * point[-1])
         residual, jacobian = now.linearised(point.at[-1].set(lower))
         return residual, jacobian.at[:, -1].set(-load)
@@ -267,7 +267,7 @@ def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way
 
 
 def _first(job: tuple, ends: Array, steps: StepControl, downward: Array, way: _Way) -> Tracing:
-    """The walk of one job before its first point."""
+    """The initial state of one job."""
     balance, start = job
     if start is None:
         begin = jnp.where(downward, ends[1], ends[0])
@@ -276,11 +276,11 @@ def _first(job: tuple, ends: Array, steps: StepControl, downward: Array, way: _W
         start = balance.point(linear, begin)
     sense = 1.0 if way in ("rising", "past") else jnp.where(downward, -1.0, 1.0)
     direction = jnp.zeros_like(start).at[-1].set(sense)
-    return _tracer(balance, ends, steps, way).begun(start, direction)
+    return _tracer(balance, ends, steps, way).initial(start, direction)
 
 
 @compiled
-def _begun(
+def _initial(
     jobs: tuple,
     wanted: Bool[Array, " lane"],
     ends: Array,
@@ -288,16 +288,16 @@ def _begun(
     downward: Array,
     way: _Way,
 ) -> StateRows:
-    def begun(job: tuple, wanted: Array) -> Tracing:
+    def initial(job: tuple, wanted: Array) -> Tracing:
         status = jnp.where(wanted, RUNNING, int(CurveStatus.NO_START))
         return _first(job, ends, steps, downward, way)._replace(status=status)
 
-    return in_rows(jax.vmap(begun)(jobs, wanted))
+    return in_rows(jax.vmap(initial)(jobs, wanted))
 
 
 def _advanced(
     jobs: tuple,
-    walks: StateRows,
+    states: StateRows,
     ends: Array,
     steps: StepControl,
     downward: Array,
@@ -305,16 +305,16 @@ def _advanced(
     way: _Way,
     length: int,
 ) -> tuple[StateRows, tuple, tuple]:
-    def result(walk: Tracing) -> tuple:
-        return walk.status == RUNNING, walk.status, walk.n_solves
+    def result(state: Tracing) -> tuple:
+        return state.status == RUNNING, state.status, state.n_solves
 
-    def step(job: tuple, walk: Tracing) -> tuple[Tracing, tuple]:
+    def step(job: tuple, state: Tracing) -> tuple[Tracing, tuple]:
         tracer = _tracer(job[0], ends, steps, way)
-        walk, kept = tracer.corrected(walk) if length == _ALONE else tracer.advanced(walk)
-        return walk, (kept, walk.here, walk.tangent)
+        state, kept = tracer.corrected(state) if length == _ALONE else tracer.advanced(state)
+        return state, (kept, state.here, state.tangent)
 
-    begun = partial(_first, ends=ends, steps=steps, downward=downward, way=way)
-    return iterated(begun, step, result, jobs, walks, length, idle)
+    initial = partial(_first, ends=ends, steps=steps, downward=downward, way=way)
+    return iterated(initial, step, result, jobs, states, length, idle)
 
 
 _advanced_alone = compiled(_advanced)

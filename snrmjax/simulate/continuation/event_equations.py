@@ -1,9 +1,9 @@
 """Equations whose solutions are events of forced responses as a parameter of the model changes.
 
-A fold, a peak, a period doubling and a Neimark-Sacker point are motions at which a matrix is
+A fold, a peak, a period doubling and a Neimark-Sacker point are motions at which a matrix A is
 singular. Bordered by a row and a column it is regular, and the last entry g of
-[A b; cᵀ 0] (v; g) = (0; 1) vanishes where A is singular: one equation beside the balance, with
-the gradient ∂g = −wᵀ(∂A)v of v and of w from the transposed system.
+[A b; cᵀ 0] (v; g) = (0; 1) vanishes where A is singular: one equation in addition to the balance,
+with the gradient ∂g = −wᵀ(∂A)v, w being the solution of the transposed system.
 Reference: Govaerts, Numerical Methods for Bifurcations of Dynamical Equilibria (2000), chapters 3
 and 4, doi:10.1137/1.9780898719543; of harmonic balance: Detroux et al., Comput. Methods Appl. Mech.
 Eng. 296 (2015) 18, doi:10.1016/j.cma.2015.07.017; Xie et al., Mech. Syst. Signal Process. (2017),
@@ -26,11 +26,11 @@ from snrmjax.simulate.continuation.events import velocities_along
 from snrmjax.simulate.continuation.newton import Point
 
 EventKind = Literal["fold", "peak", "phase_resonance", "period_doubling", "neimark_sacker"]
-FORCE = "force"  # the name of the parameter that is no number of the model
+FORCE = "force"  # the parameter that is not one of the model
 
 
 class Bordered(NamedTuple):
-    """Of a matrix A: g, which vanishes where A is singular, and what A v and wᵀA come near zero."""
+    """Solution of a bordered system of A: g, zero where A is singular, and v and w."""
 
     g: Inexact[Array, ""]
     right: Inexact[Array, " size"]
@@ -40,9 +40,9 @@ class Bordered(NamedTuple):
 class EventEquations(eqx.Module):
     """Motions at an event of one kind, R(x, λ, μ) = 0 and g(x, λ, μ) = 0, as μ changes.
 
-    The unknowns are those of the balance, then for a Neimark-Sacker point the square of its second
-    frequency over `frequency_scale`, and last the parameter over its scale. `balance` is that of
-    `model` with its further modes, at any force.
+    The unknowns are those of the balance, for a Neimark-Sacker point the squared second frequency
+    over `frequency_scale`, and last the scaled parameter. `balance` is that of `model` with its
+    further modes, at any force.
     """
 
     model: Structure
@@ -75,20 +75,20 @@ class EventEquations(eqx.Module):
         if self.kind == "phase_resonance":
             value, slope = jax.value_and_grad(self._quadrature)(point)
             return value[None], slope[None]
-        found = bordered(self.matrix(point, jacobian))
+        null = bordered(self.matrix(point, jacobian))
 
         def parts(point: Point) -> Array:
-            value = -found.left @ self.image(point, found.right)
+            value = -null.left @ self.image(point, null.right)
             return jnp.stack([value.real, value.imag]) if self._oscillates else value[None]
 
         slopes = jax.jacrev(parts)(point)
         if not self._oscillates:
-            return found.g[None], slopes
-        # Without the second frequency the imaginary part would vanish of itself: over it, it has
-        # a sense there.
+            return null.g[None], slopes
+        # At a second frequency of zero the imaginary part vanishes identically: divided by it, the
+        # equation stays regular.
         second = jnp.sqrt(point[-2])
         fraction = jnp.array([1.0, 1.0 / second])
-        values = jnp.stack([found.g.real, found.g.imag]) * fraction
+        values = jnp.stack([null.g.real, null.g.imag]) * fraction
         slopes = (slopes * fraction[:, None]).at[1, -2].add(-0.5 * values[1] / point[-2])
         return values, slopes
 
@@ -127,7 +127,7 @@ class EventEquations(eqx.Module):
         return jacobian[:, :size] + 1j * second * by_rate - point[-2] * inertia
 
     def image(self, point: Point, vector: Inexact[Array, " size"]) -> Inexact[Array, " size"]:
-        """A v, without A."""
+        """A v, without forming A."""
         motion, balance = point[: self.balance.size + 1], self.at(point[-1])
 
         def along(direction: Array) -> Array:
@@ -157,7 +157,7 @@ class EventEquations(eqx.Module):
         return still + (1j * second * rate - point[-2] * inertia).reshape(-1)
 
     def _viscous(self, balance: HarmonicBalance, motion: Point) -> Float[Array, "time mode mode"]:
-        """∂(force)/∂q̇ over a period, over the frequency's scale."""
+        """∂(force)/∂q̇ over a period, divided by the frequency scale."""
         basis = harmonic_basis(balance.harmonic_order, balance.n_samples)
         x = balance.coefficients(motion)
         samples = jnp.asarray(basis.synthesis) @ x
@@ -166,7 +166,7 @@ class EventEquations(eqx.Module):
         return balance.model.slopes(samples, rate)[1] / balance.frequency_scale
 
     def _doubled(self, point: Point) -> tuple[HarmonicBalance, np.ndarray]:
-        """The balance over two periods, and which of its equations are of odd harmonics."""
+        """The balance over two periods, and the indices of its odd harmonics."""
         balance = self.at(point[-1])
         order, n = 2 * balance.harmonic_order, balance.model.n_modes
         doubled = HarmonicBalance(
@@ -186,27 +186,27 @@ class EventEquations(eqx.Module):
         n, order = self.balance.model.n_modes, self.balance.harmonic_order
         rows = motion[:-1].reshape(self.balance.n_coefficients, n)
         even = 2 * np.arange(1, order + 1)
-        place = np.concatenate([[0], np.stack([2 * even - 1, 2 * even], axis=1).ravel()])
-        wide = jnp.zeros((4 * order + 1, n)).at[place].set(rows)
+        index = np.concatenate([[0], np.stack([2 * even - 1, 2 * even], axis=1).ravel()])
+        wide = jnp.zeros((4 * order + 1, n)).at[index].set(rows)
         return jnp.append(wide.reshape(-1), 0.5 * motion[-1])
 
 
 def bordered(matrix: Inexact[Array, "size size"]) -> Bordered:
-    """g of a matrix with borders near its null vectors, for which nothing grows large.
+    """g of a matrix with borders near its null vectors, so that the system is well conditioned.
 
-    The first borders are by chance. The second are b along A⁻ᵀ of the first row and c along A⁻¹b:
-    then g = −1/|A⁻¹b| has no poles, to which Newton's method would converge as to zeros. Other
-    borders change g by a factor, which an equation g = 0 does not see.
+    The first borders are random. The second are b along A⁻ᵀ of the first row and c along A⁻¹b:
+    then g = −1/|A⁻¹b| has no poles, to which Newton's method could converge as to zeros. Borders
+    change g by a factor, which does not affect the equation g = 0.
     """
     size = matrix.shape[0]
     draw = np.random.default_rng(size).normal(size=(2, size)) / np.sqrt(size)
     column, row = jnp.asarray(draw, dtype=matrix.dtype)
     factors = _factorised(matrix, column, row)
     first = _null(factors)
-    length = jnp.linalg.norm(first.left)
-    column = first.left.conj() / length
+    norm = jnp.linalg.norm(first.left)
+    column = first.left.conj() / norm
     inside = jax.scipy.linalg.lu_solve(factors, jnp.append(column, 0.0))[:-1]
-    row = first.g * inside - length * first.right
+    row = first.g * inside - norm * first.right
     return _null(_factorised(matrix, column, row.conj() / jnp.linalg.norm(row)))
 
 

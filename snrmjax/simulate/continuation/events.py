@@ -18,8 +18,8 @@ from snrmjax.simulate.continuation.event_location import Bracket, EventSearch
 from snrmjax.simulate.continuation.newton import correct
 
 EVENT_KINDS = (CurveEvent.FOLD, CurveEvent.PEAK, CurveEvent.PHASE_RESONANCE)
-_INSIDE = 7  # points inside an interval that is looked at more closely
-_MANY = 8  # times as many lanes, where there are points for them
+_INSIDE = 7  # points added inside an interval that is refined
+_MANY = 8  # factor on the number of lanes, if there are enough points
 
 
 def velocities_along(
@@ -27,28 +27,30 @@ def velocities_along(
     points: Float[Array | np.ndarray, "*point unknown"],
     tangents: Float[Array | np.ndarray, "*point unknown"],
 ) -> tuple[Float[Array, "*point 4"], Float[Array, "*point 4"]]:
-    """What events are told by, and its slopes in arclength: of one point or of many.
+    """Test quantities of events and their derivatives by arclength, of one point or many.
 
-    λ, |velocity fundamental|² at the first sensor, and of the mode of interest its parts a quarter
-    period ahead of the force and in phase with it, all scaled. Of NumPy's arrays on the host: for a
-    few hundred points that is done before a program would have its arguments.
+    λ, |velocity fundamental|² at the first sensor, and the parts of that of the mode of interest a
+    quarter period ahead of the force and in phase with it, all scaled. NumPy arrays are computed on
+    the host: for a few hundred points that is faster than a call of a program.
     """
     xp: Any = np if isinstance(points, np.ndarray) else jnp
     modes, j = balance.model.modes, balance.model.modes.mode_of_interest
     shape = modes.mode_shape[0] / xp.max(xp.abs(modes.mode_shape[0]))
     drive = xp.abs(modes.participation)
     drive = drive / xp.maximum(xp.max(drive), np.finfo(float).tiny)
-    # Where the force leaves the mode of interest alone, what it moves tells the phase.
+    # If the force does not drive the mode of interest, the driven modes define the phase.
     of_interest = np.eye(balance.model.n_modes)[j]
     weight = xp.sign(modes.participation) * xp.where(drive[j] > STILL, of_interest, drive)
-    size = (*points.shape[:-1], balance.n_coefficients, balance.model.n_modes)
-    pairs, turns = (rows[..., :-1].reshape(size)[..., 1:3, :] for rows in (points, tangents))
+    shape_of_pairs = (*points.shape[:-1], balance.n_coefficients, balance.model.n_modes)
+    pairs, rates = (
+        rows[..., :-1].reshape(shape_of_pairs)[..., 1:3, :] for rows in (points, tangents)
+    )
     omega, faster = points[..., -1], tangents[..., -1]
-    seen, change = pairs @ shape, turns @ shape
+    seen, change = pairs @ shape, rates @ shape
     square = xp.sum(seen**2, axis=-1)
     growth = 2 * omega * (faster * square + omega * xp.sum(seen * change, axis=-1))
     # The velocity is Ω (sine + i cosine).
-    modal, rate = pairs @ weight, turns @ weight
+    modal, rate = pairs @ weight, rates @ weight
     parts = omega[..., None] * modal
     slopes = faster[..., None] * modal + omega[..., None] * rate
     return (
@@ -68,11 +70,11 @@ def _search(job: tuple, steps: StepControl) -> EventSearch:
 
 
 @compiled
-def _begun(jobs: tuple, wanted: Bool[Array, " lane"], steps: StepControl) -> StateRows:
-    def begun(job: tuple, wanted: Array) -> Bracket:
-        return _search(job, steps).begun()._replace(ended=~wanted)
+def _initial(jobs: tuple, wanted: Bool[Array, " lane"], steps: StepControl) -> StateRows:
+    def initial(job: tuple, wanted: Array) -> Bracket:
+        return _search(job, steps).initial()._replace(ended=~wanted)
 
-    return in_rows(jax.vmap(begun)(jobs, wanted))
+    return in_rows(jax.vmap(initial)(jobs, wanted))
 
 
 @compiled
@@ -85,22 +87,24 @@ def _advanced(
     def step(job: tuple, state: Bracket) -> tuple[Bracket, tuple]:
         return _search(job, steps).advanced(state), (jnp.array(False),)
 
-    return iterated(lambda j: _search(j, steps).begun(), step, result, jobs, states, TOGETHER, idle)
+    return iterated(
+        lambda j: _search(j, steps).initial(), step, result, jobs, states, TOGETHER, idle
+    )
 
 
 def _searched(jobs: tuple, steps: StepControl) -> tuple[np.ndarray, ...]:
-    """Of every job (balance, kind, neighbour, its tangent, other neighbour): where it ended.
+    """Event searches of jobs (balance, kind, neighbour, its tangent, other neighbour).
 
-    Point and tangent, whether that is the event, and whether there is one that was not found.
+    Returns last points and tangents, whether they are events, and whether events were missed.
     """
 
-    def begun(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> StateRows:
-        return _begun(jobs, wanted, steps)
+    def initial(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> StateRows:
+        return _initial(jobs, wanted, steps)
 
     def advanced(jobs: tuple, states: StateRows, idle: int) -> tuple[StateRows, tuple, tuple]:
         return _advanced(jobs, states, steps, np.array(idle))
 
-    return in_lanes(begun, advanced, jobs, lanes_for(jobs[0].size + 1))[0]
+    return in_lanes(initial, advanced, jobs, lanes_for(jobs[0].size + 1))[0]
 
 
 @compiled
@@ -113,9 +117,9 @@ def _between(
     fraction: Array,
     steps: StepControl,
 ) -> tuple:
-    """Points of the curve at shares of the way between neighbours, with their tangents.
+    """Points of the curve at fractions of the interval between neighbours, with tangents.
 
-    Guessed by the cubic through both neighbours with their tangents.
+    The guesses are those of the cubic through both neighbours with their tangents.
     """
 
     def corrected(balance: HarmonicBalance, *row: Array) -> tuple:
@@ -123,11 +127,13 @@ def _between(
         length = tangent @ (there - here)
         chord = there - here
         early, late = (jnp.linalg.norm(chord) * t - chord for t in (tangent, arriving))
-        bend = fraction * (1 - fraction) * ((1 - fraction) * early - fraction * late)
-        guess = here + fraction * chord + bend
+        curvature = fraction * (1 - fraction) * ((1 - fraction) * early - fraction * late)
+        guess = here + fraction * chord + curvature
         guess = guess + (fraction * length - tangent @ (guess - here)) * tangent
-        found = correct(balance.linearised, guess, tangent, steps.tolerance, 2 * steps.iterations)
-        return found.point, found.tangent, found.converged
+        solution = correct(
+            balance.linearised, guess, tangent, steps.tolerance, 2 * steps.iterations
+        )
+        return solution.point, solution.tangent, solution.converged
 
     return jax.vmap(corrected)(balances, here, tangent, there, arriving, fraction)
 
@@ -139,10 +145,10 @@ def with_events(
 
     Those that could not be located are named in `not_located`.
 
-    Arguments: `balances` stacked, one for every curve. Between neighbours every change of sign
-    is located; where the cubic through both hints at two changes, the interval is divided first.
-    A peak is a maximum of the velocity fundamental at the first sensor; a phase resonance has
-    the velocity in phase with the force.
+    Arguments: `balances` stacked, one for every curve. Every sign change between neighbours is
+    located; where the cubic through both suggests two, the interval is subdivided first. A peak is
+    a maximum of the velocity fundamental at the first sensor; at a phase resonance the velocity is
+    in phase with the force.
     """
 
     def heights_of(number: int, curve: TracedCurve) -> tuple:
@@ -169,13 +175,13 @@ def with_events(
         return divided
     here, ahead, there, _ = neighbours_of(divided, owner, position)
     jobs = (taken(balances, np.array(owner)), np.array(kind), here, ahead, there)
-    found, tangents, resolved, missed = _searched(jobs, steps)
+    located, tangents, resolved, missed = _searched(jobs, steps)
     for e in np.flatnonzero(missed).tolist():
         curve = divided[owner[e]]
         missed_too = (*curve.not_located, EVENT_KINDS[kind[e]])
         divided[owner[e]] = curve._replace(not_located=missed_too)
     new = [
-        NewPoint(owner[e], position[e], found[e], tangents[e], EVENT_KINDS[kind[e]])
+        NewPoint(owner[e], position[e], located[e], tangents[e], EVENT_KINDS[kind[e]])
         for e in np.flatnonzero(resolved).tolist()
     ]
     return inserted(divided, new)
@@ -191,24 +197,24 @@ def _divided(
             continue
         heights, slopes = known[number]
         length = np.linalg.norm(np.diff(curve.points, axis=0), axis=1)
-        doubtful = np.zeros(len(length), dtype=bool)
+        suspect = np.zeros(len(length), dtype=bool)
         for column in range(2):
-            doubtful |= _slope_may_vanish_twice(heights[:, column], slopes[:, column], length)
-        doubtful |= _may_vanish_twice(heights[:, 2], slopes[:, 2], length)
-        for k in np.flatnonzero(doubtful):
+            suspect |= _slope_may_vanish_twice(heights[:, column], slopes[:, column], length)
+        suspect |= _may_vanish_twice(heights[:, 2], slopes[:, 2], length)
+        for k in np.flatnonzero(suspect):
             owner += [number] * _INSIDE
             position += [int(k)] * _INSIDE
             fraction += [(i + 1) / (_INSIDE + 1) for i in range(_INSIDE)]
     if not owner:
         return list(curves)
     between = neighbours_of(curves, owner, position)
-    found, tangents, ok = points_between(
+    added, tangents, ok = points_between(
         balances, np.array(owner), between, np.array(fraction), steps
     )
     keep = np.flatnonzero(ok).tolist()
     return inserted(
         curves,
-        [NewPoint(owner[k], position[k], found[k], tangents[k], CurveEvent.NONE) for k in keep],
+        [NewPoint(owner[k], position[k], added[k], tangents[k], CurveEvent.NONE) for k in keep],
     )
 
 
@@ -219,9 +225,9 @@ def points_between(
     fraction: Float[np.ndarray, " point"],
     steps: StepControl,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points at shares of the way between neighbours, their tangents, and whether they were found.
+    """Points at fractions of intervals between neighbours, tangents, and whether they converged.
 
-    Arguments: `owner` says of which of the `balances` a point is, `neighbours` are its own.
+    Arguments: `owner` is the index of each point's balance, `neighbours` are its own.
     """
     n, ahead, rows = len(owner), neighbours[1], (*neighbours, fraction)
     lanes = lanes_for(balances.size + 1)
@@ -230,19 +236,19 @@ def points_between(
     def corrected(begin: int) -> list[np.ndarray]:
         index = np.minimum(np.arange(begin, begin + lanes), n - 1)
         mine = taken(balances, owner[index])
-        found = _between(mine, *(row[index] for row in rows), steps)
-        return [np.asarray(part)[: n - begin] for part in found]
+        solutions = _between(mine, *(row[index] for row in rows), steps)
+        return [np.asarray(part)[: n - begin] for part in solutions]
 
     parts = over_cores(corrected, range(0, n, lanes))
-    found, tangents, ok = (np.concatenate(column) for column in zip(*parts, strict=True))
-    turned = np.einsum("ku,ku->k", tangents, ahead) < 0
-    return found, np.where(turned[:, None], -tangents, tangents), ok
+    points, tangents, ok = (np.concatenate(column) for column in zip(*parts, strict=True))
+    reversed_ = np.einsum("ku,ku->k", tangents, ahead) < 0
+    return points, np.where(reversed_[:, None], -tangents, tangents), ok
 
 
 def neighbours_of(
     curves: list[TracedCurve], owner: Sequence[int], position: Sequence[int]
 ) -> tuple[np.ndarray, ...]:
-    """Points and tangents at positions on curves, then those behind them."""
+    """Points and tangents at positions on curves, then those of the next points."""
     pairs = list(zip(owner, position, strict=True))
     return tuple(
         np.stack([(curves[o].points, curves[o].tangents)[which][k + ahead] for o, k in pairs])
@@ -254,7 +260,7 @@ def neighbours_of(
 def _slope_may_vanish_twice(
     height: np.ndarray, slope: np.ndarray, length: np.ndarray
 ) -> Bool[np.ndarray, " interval"]:
-    """Whether the slope keeps its sign at both ends but the cubic between them turns back."""
+    """Whether the slope has one sign at both ends but may vanish on the cubic in between."""
     first, last = slope[:-1], slope[1:]
     chord = np.diff(height) / length
     # p'(u) = first + u(6 chord − 4 first − 2 last) + u²(3 first + 3 last − 6 chord), u in 0…1.
@@ -264,19 +270,19 @@ def _slope_may_vanish_twice(
         extreme = first - b**2 / (4 * a)
     same = np.signbit(first) == np.signbit(last)
     least = np.minimum(np.abs(first), np.abs(last))
-    # A margin, since the cubic is only near the curve.
-    turns = extreme * np.sign(first) < 0.3 * least
-    return same & (u > 0) & (u < 1) & turns
+    # With a margin, since the cubic only approximates the curve.
+    vanishes = extreme * np.sign(first) < 0.3 * least
+    return same & (u > 0) & (u < 1) & vanishes
 
 
 def _may_vanish_twice(
     height: np.ndarray, slope: np.ndarray, length: np.ndarray
 ) -> Bool[np.ndarray, " interval"]:
-    """Whether the height keeps its sign at both ends but the cubic between them comes near zero."""
+    """Whether the height has one sign at both ends but may vanish in between."""
     first, last = height[:-1], height[1:]
     same = np.signbit(first) == np.signbit(last)
     towards = (slope[:-1] * first < 0) & (slope[1:] * last > 0)
-    # The tangents from both ends bound a convex piece from below.
+    # The tangents at both ends bound a convex piece from below.
     bound = np.minimum(
         np.abs(first) - np.abs(slope[:-1]) * length, np.abs(last) - np.abs(slope[1:]) * length
     )
@@ -284,7 +290,7 @@ def _may_vanish_twice(
 
 
 class NewPoint(NamedTuple):
-    """A point to be put between two neighbours of a curve."""
+    """A point to be inserted between two neighbours of a curve."""
 
     owner: int  # which curve
     position: int  # the neighbour before it
@@ -295,16 +301,18 @@ class NewPoint(NamedTuple):
 
 
 def inserted(curves: list[TracedCurve], new: list[NewPoint]) -> list[TracedCurve]:
-    """The curves with new points put in their places, in order along each step."""
+    """The curves with new points inserted, in order along each step."""
     result = list(curves)
     for number in sorted({e.owner for e in new}):
         curve, mine = curves[number], [e for e in new if e.owner == number]
         where = np.array([e.position for e in mine])
         ahead = curve.tangents[where]
         points = np.stack([e.point for e in mine])
-        turn = np.stack([e.tangent for e in mine])
+        tangents = np.stack([e.tangent for e in mine])
         along = np.einsum("ku,ku->k", points - curve.points[where], ahead)
-        turn = np.where((np.einsum("ku,ku->k", turn, ahead) < 0)[:, None], -turn, turn)
+        tangents = np.where(
+            (np.einsum("ku,ku->k", tangents, ahead) < 0)[:, None], -tangents, tangents
+        )
         n = len(curve.points)
         order = np.lexsort((np.append(np.zeros(n), along), np.append(np.arange(n), where)))
         events = [*curve.events, *(e.event for e in mine)]
@@ -313,7 +321,7 @@ def inserted(curves: list[TracedCurve], new: list[NewPoint]) -> list[TracedCurve
             multipliers = np.concatenate([multipliers, [e.multipliers for e in mine]])[order]
         result[number] = curve._replace(
             points=np.concatenate([curve.points, points])[order],
-            tangents=np.concatenate([curve.tangents, turn])[order],
+            tangents=np.concatenate([curve.tangents, tangents])[order],
             events=tuple(events[k] for k in order),
             multipliers=multipliers,
         )

@@ -1,4 +1,4 @@
-"""Periodic motions with the harmonics that their balance has left out."""
+"""Periodic motions with twice the harmonics of their balance."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,22 +14,22 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_member, mapped
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import BY_CYCLE, HarmonicBalance, samples_for
-from snrmjax.simulate.continuation.newton import Point, solved_behind
+from snrmjax.simulate.continuation.newton import Point, solve_appended
 
-_TOLERANCE = 1e-7  # of the scaled unknowns, on the last correction
-_ROUNDS = 12  # of corrections at most; three to five do
+_TOLERANCE = 1e-7  # norm of the last correction of the scaled unknowns
+_ROUNDS = 12  # most corrections; three to five suffice
 
 
-class _Correcting(NamedTuple):
-    """Corrections under way."""
+class _Iteration(NamedTuple):
+    """State of the iteration."""
 
     point: Point
     moved: Float[Array, ""]  # length of the last correction
-    rounds: Int[Array, ""]
+    n_corrections: Int[Array, ""]
 
 
 def has_contacts(model: Structure) -> bool:
-    """Whether contacts or friction bend the forces along a motion: their harmonics fade slowly."""
+    """Whether contacts or friction make the forces nonsmooth: their harmonics decay slowly."""
     return any(isinstance(force, BY_CYCLE) for force in model.forces)
 
 
@@ -38,9 +38,9 @@ def completed_motions(
 ) -> tuple[Float[np.ndarray, "point coefficient mode"], Float[np.ndarray, " point"]]:
     """Coefficients (kg^1/2 m) and frequencies (rad/s) of scaled points with twice the harmonics.
 
-    Where a contact closes and a slider slips depends on harmonics beyond those of the balance, and
-    with it the stability. A motion that is not found with them is NaN: its stability is not known.
-    Arguments: `balances` stacked; `owner` says of which of them a point is.
+    When a contact closes or a slider slips depends on harmonics beyond those of the balance, and so
+    does the stability. A motion that does not converge is NaN: its stability is not known.
+    Arguments: `balances` stacked; `owner` is the index of each point's balance.
     """
     wide = by_member(_completed, balances, owner, points)
     missed = np.isnan(wide[:, -1]) & np.isfinite(points[:, -1])
@@ -66,20 +66,20 @@ def _completed_by_newton(
 
 
 def _of(balance: HarmonicBalance, point: Point) -> Point:
-    """The point with twice the harmonics, NaN where they do not settle.
+    """The point with twice the harmonics, NaN if the iteration does not converge.
 
-    Newton's method with two parts of the Jacobian: that of the balance at the point, across its
-    null vector, so that it passes folds; and for every harmonic beyond the dynamic stiffness of
-    each mode with its mean tangent stiffness. What couples them is small, and left to the rounds.
+    Newton's method with a block-diagonal Jacobian: that of the balance at the point, inverted
+    across its null vector, so that it passes folds; and for every higher harmonic the dynamic
+    stiffness of each mode with its mean tangent stiffness. Their coupling is small and neglected.
     """
     wide, size, n = _widened(balance), balance.size, balance.model.n_modes
     jacobian = balance.linearised(point)[1]
-    # Columns of the pseudo-inverse: the shortest correction for each equation.
+    # Columns of the pseudo-inverse: the minimum-norm correction for each equation.
     gram = jacobian @ jacobian.T
-    shortest = jacobian.T @ solved_behind(jnp.concatenate([gram, jnp.eye(size)]))
+    shortest = jacobian.T @ solve_appended(jnp.concatenate([gram, jnp.eye(size)]))
     terms = balance.model.linear_terms()
     orders = np.arange(balance.harmonic_order + 1, wide.harmonic_order + 1)[:, None]
-    # The mean equation's derivative by the mean displacement is the mean tangent stiffness.
+    # The derivative of the mean equation by the mean displacement is the mean tangent stiffness.
     speed, stiffness = orders * point[-1], jnp.diag(jacobian[:n, :n])
     dynamic = stiffness - terms.mass * speed**2
     dynamic = dynamic - 1j * terms.damping * speed / balance.frequency_scale
@@ -95,29 +95,29 @@ def _of(balance: HarmonicBalance, point: Point) -> Point:
 
 
 def _by_newton(balance: HarmonicBalance, point: Point) -> Point:
-    """The same with the whole Jacobian in each round, where the parts' coupling is not small."""
+    """The same with the full Jacobian in each iteration, for strong coupling of the blocks."""
     wide = _widened(balance)
 
     def change(at: Point) -> Point:
         residual, jacobian = wide.linearised(at)
         gram = jacobian @ jacobian.T
-        return solved_behind(jnp.concatenate([gram, residual[None]]))[0] @ jacobian
+        return solve_appended(jnp.concatenate([gram, residual[None]]))[0] @ jacobian
 
     return _settled(change, _padded(wide, point))
 
 
 def _settled(change: Callable[[Point], Point], start: Point) -> Point:
-    """Where corrections end, NaN where they do not."""
+    """The fixed point of the corrections, NaN if they do not converge."""
 
-    def corrected(last: _Correcting) -> _Correcting:
+    def corrected(last: _Iteration) -> _Iteration:
         step = change(last.point)
-        return _Correcting(last.point - step, jnp.linalg.norm(step), last.rounds + 1)
+        return _Iteration(last.point - step, jnp.linalg.norm(step), last.n_corrections + 1)
 
-    def goes_on(last: _Correcting) -> Array:
-        return (last.moved > _TOLERANCE) & (last.rounds < _ROUNDS)
+    def goes_on(last: _Iteration) -> Array:
+        return (last.moved > _TOLERANCE) & (last.n_corrections < _ROUNDS)
 
-    begun = _Correcting(start, jnp.array(jnp.inf), jnp.array(0))
-    end = jax.lax.while_loop(goes_on, corrected, begun)
+    first = _Iteration(start, jnp.array(jnp.inf), jnp.array(0))
+    end = jax.lax.while_loop(goes_on, corrected, first)
     return jnp.where(end.moved <= _TOLERANCE, end.point, jnp.nan)
 
 
@@ -127,7 +127,7 @@ def _padded(wide: HarmonicBalance, point: Point) -> Point:
 
 
 def _widened(balance: HarmonicBalance) -> HarmonicBalance:
-    """The same balance with twice the harmonics."""
+    """The balance with twice the harmonics."""
     order = 2 * balance.harmonic_order
     samples = max(samples_for(balance.model, order, None), balance.n_samples)
     return dataclasses.replace(balance, harmonic_order=order, n_samples=samples)

@@ -1,4 +1,4 @@
-"""Monodromy matrices: what small disturbances of a periodic motion become over one period."""
+"""Monodromy matrices: the linearised map of a periodic motion over one period."""
 
 from functools import partial
 
@@ -27,11 +27,11 @@ from snrmjax.simulate.continuation.friction_along import (
 )
 
 _MOST_SEGMENTS = 256
-_SEGMENT = 32  # steps whose propagators, or kicks, are computed side by side
+_SEGMENT = 32  # steps whose propagators, or kicks, are computed as a batch
 _KICKS = 3  # for every step of Magnus' method
 _LEAST_KICKS = 240
-_FEW_MODES = 6  # whose matrices are multiplied term by term, several points at once
-_FEW_SLIDERS = 16  # whose slip begins and ends with a step
+_FEW_MODES = 6  # most modes with matrices multiplied term by term, points along the last axis
+_FEW_SLIDERS = 16  # most sliders with steps aligned to their slip events
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
 
@@ -44,12 +44,12 @@ def monodromy(
 ) -> Float[Array, "point state state"]:
     """The linearised map of (δq, δq̇ over the fastest natural frequency) over one period.
 
-    Behind them stand the positions of sliders at other places than the first one's, where there
-    are any, and states of laws with a memory. NaN where more steps would be needed than any
-    sensible motion needs, and for contacts whose normal force moves.
+    Followed by the positions of sliders at attachment points other than the first, and by internal
+    variables of friction laws. NaN where more steps would be needed than any sensible motion
+    needs, and for contacts with variable normal force.
     """
     if any(len(force.rows) > 1 for force in model.forces):
-        # Their slip cannot be followed between samples here.
+        # Their slip events cannot be located between samples here.
         unknown = (frequency.shape[0], 2 * model.n_modes, 2 * model.n_modes)
         return jnp.full(unknown, jnp.nan)
     if not all(map(_is_spring, model.forces)):
@@ -58,7 +58,7 @@ def monodromy(
 
 
 def _is_spring(force: AbstractForce) -> bool:
-    """Whether a force is a smooth function of the displacement, as a potential's is."""
+    """Whether a force is a smooth function of the displacement, like that of a potential."""
     smooth = isinstance(force, AbstractMemoryless) and not isinstance(force, AbstractNonsmooth)
     shape = type(force).shape
     return smooth and shape is not None and shape.argument is Argument.DISPLACEMENT
@@ -67,13 +67,13 @@ def _is_spring(force: AbstractForce) -> bool:
 def _by_kicks(
     model: Structure, coefficients: Array, frequency: Array, steps_per_cycle: Array
 ) -> Float[Array, "point state state"]:
-    """The map of springs and potential: oscillators that a varying stiffness kicks equally often.
+    """The map for springs and a potential: oscillators with equally spaced stiffness kicks.
 
-    Between kicks every mode moves by itself with its own damping and mean tangent stiffness, or
-    all together where the damping couples them, which is exact; the kicks hold what else varies and
-    couples, K(t). With K − h²K²/12 in place of K the map is that of a fourth-order method but for a
-    change of coordinates, which its eigenvalues do not see: [B, [A, B]] of the flow A and the kicks
-    B holds K² alone, whatever the damping.
+    Between kicks every mode moves with its own damping and mean tangent stiffness (all modes
+    together if the damping couples them), which is solved exactly; the kicks apply the remaining
+    varying and coupling stiffness K(t). With K − h²K²/12 in place of K the method is of order 4 up
+    to a change of coordinates, which leaves the eigenvalues unchanged: the commutator [B, [A, B]]
+    of the flow A and the kicks B contains K² alone, whatever the damping.
     Reference: Takahashi & Imada, J. Phys. Soc. Jpn. 53 (1984) 3765, doi:10.1143/JPSJ.53.3765;
     López-Marcos, Sanz-Serna & Skeel, SIAM J. Sci. Comput. 18 (1997) 223,
     doi:10.1137/S1064827595288085.
@@ -110,7 +110,7 @@ def _by_kicks(
     kicks = jnp.maximum(_KICKS * steps_per_cycle * cycles, _LEAST_KICKS)
     n_segments, step = _segments(kicks, _KICKS * _MOST_SEGMENTS)
     speed = jnp.max(terms.stiffness / terms.mass) ** 0.5 / frequency  # of δq̇, over Ω
-    # Of few modes the points lie along the last axis, of many along the first.
+    # The points lie along the last axis for few modes, along the first for many.
     wide = n > _FEW_MODES
     of_states = -2 if wide else 0
 
@@ -150,28 +150,28 @@ def _by_kicks(
 
     eye = laid_out(jnp.broadcast_to(jnp.eye(2 * n)[:, :, None], (2 * n, 2 * n, n_points)))
     begin = tuple(jnp.split(eye, 2, of_states))
-    found = jnp.concatenate(jax.lax.fori_loop(0, n_segments, segment, begin), of_states)
-    return jnp.where(n_segments > 0, found if wide else jnp.moveaxis(found, 2, 0), jnp.nan)
+    final = jnp.concatenate(jax.lax.fori_loop(0, n_segments, segment, begin), of_states)
+    return jnp.where(n_segments > 0, final if wide else jnp.moveaxis(final, 2, 0), jnp.nan)
 
 
 def _segments(steps: Array, most: int) -> tuple[Array, Array]:
-    """So many segments of steps for one period, none when they are too many; and the step."""
+    """The number of segments of steps for one period, zero if too many; and the step."""
     needed = jnp.ceil(steps / _SEGMENT)
-    # A motion that needs more is so far off that its tangents overflow anyway.
+    # A motion that needs more has diverged so far that its tangents overflow anyway.
     n_segments = jnp.where(needed <= most, needed, 0).astype(int)
     return n_segments, 2 * jnp.pi / (n_segments * _SEGMENT)
 
 
 def _oscillation(stiffness: Array, damping: Array, step: Array, speed: Array) -> tuple:
-    """(q, q̇/speed) after a step from either: y″ + damping y′ + stiffness y = 0, of any sign."""
+    """Map of (q, q̇/speed) over a step of y″ + damping y′ + stiffness y = 0, of any sign."""
     squared = stiffness - 0.25 * damping**2
     rate = jnp.sqrt(jnp.maximum(jnp.abs(squared), 1e-16))
-    swings = squared > 0
-    even = jnp.where(swings, jnp.cos(rate * step), jnp.cosh(rate * step))
-    odd = jnp.where(swings, jnp.sin(rate * step), jnp.sinh(rate * step)) / rate
-    left = jnp.exp(-0.5 * damping * step)
+    oscillates = squared > 0
+    even = jnp.where(oscillates, jnp.cos(rate * step), jnp.cosh(rate * step))
+    odd = jnp.where(oscillates, jnp.sin(rate * step), jnp.sinh(rate * step)) / rate
+    decay = jnp.exp(-0.5 * damping * step)
     stay, last = even + 0.5 * damping * odd, even - 0.5 * damping * odd
-    return left * stay, left * odd * speed, -left * stiffness * odd / speed, left * last
+    return decay * stay, decay * odd * speed, -decay * stiffness * odd / speed, decay * last
 
 
 def _flow(
@@ -191,12 +191,12 @@ def _flow(
 def _by_magnus(
     model: Structure, coefficients: Array, frequency: Array, steps_per_cycle: Array
 ) -> Float[Array, "point state state"]:
-    """The map of a structure whose forces depend on velocity or history, in small steps.
+    """The map for forces that depend on velocity or history, in small steps.
 
     Magnus' method of order 6 with steps that resolve the fastest tangent frequency of all points.
-    The propagators of a segment of steps are computed side by side and then applied one after the
-    other. A linear structure with sliders and stops has constant coefficients from one contact or
-    slip to the next: these are then the steps, and exact.
+    The propagators of a segment of steps are computed as a batch and then applied in sequence. A
+    linear structure with sliders and stops has constant coefficients between contact and slip
+    events: these intervals are then the steps, solved exactly.
     Reference: Blanes, Casas & Ros, BIT 40 (2000) 434, Eq. (3.10), doi:10.1023/A:1022311628317.
     """
     n, n_points = model.n_modes, frequency.shape[0]
@@ -208,37 +208,44 @@ def _by_magnus(
         few = [jnp.moveaxis(part, 2, 1) for part in (friction.slip.onsets, friction.slip.ends)]
         contacts = jnp.concatenate([contacts, *(part.reshape(-1, n_points) for part in few)])
     unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
-    places, owner, n_places = friction.places, friction.owner, friction.places.n_places
-    own = 2 * n + sum(memory.n_states for memory in friction.memories)
-    size = own + n_places
-    of_place = np.eye(n_places)[owner]  # (slider, place)
+    attachments, owner, n_attachments = (
+        friction.attachments,
+        friction.owner,
+        friction.attachments.n_attachments,
+    )
+    own = 2 * n + sum(law.n_states for law in friction.internal)
+    size = own + n_attachments
+    of_attachment = np.eye(n_attachments)[owner]  # (slider, attachment)
 
-    def generators(phase: Array, held: Array) -> Array:
-        """The matrices A of y' = A y (time, point, state, state) at phases behind the beginning."""
+    def generators(phase: Array, stuck: Array) -> Array:
+        """The matrices A of y' = A y (time, point, state, state) at phases after the start."""
         tau = friction.begin + phase
         k, c = _tangents(model, friction, coefficients, frequency, tau)
         a = jnp.zeros((len(tau), n_points, size, size))
-        if n_places:
-            loose = jnp.where(held, 0.0, friction.stiffness) @ of_place
-            moving = places.matrix(loose)
+        if n_attachments:
+            sliding_stiffness = jnp.where(stuck, 0.0, friction.stiffness) @ of_attachment
+            moving = attachments.matrix(sliding_stiffness)
             k = k - moving / (terms.mass * frequency[:, None] ** 2)[..., None]
-            pulls = jnp.broadcast_to(places.rows.T, (n, n_places)) / terms.mass[:, None]
-            a = a.at[:, :, n : 2 * n, own:].set(pulls / (unit * frequency**2)[:, None, None])
+            acceleration = (
+                jnp.broadcast_to(attachments.influence.T, (n, n_attachments))
+                / (terms.mass[:, None])
+            )
+            a = a.at[:, :, n : 2 * n, own:].set(acceleration / (unit * frequency**2)[:, None, None])
         first = 2 * n
-        for memory in friction.memories:
-            last = first + memory.n_states
-            by, row = memory.at(tau), memory.there.on_modes(jnp.ones(1))
-            per_force = row[:, None] / (terms.mass * frequency[:, None] ** 2)[..., None]
-            stiffer, damped = by[:, :, :1, :1] * row, by[:, :, :1, 1:2] * row
+        for law in friction.internal:
+            last = first + law.n_states
+            by, influence = law.at(tau), law.attachment.on_modes(jnp.ones(1))
+            per_force = influence[:, None] / (terms.mass * frequency[:, None] ** 2)[..., None]
+            stiffer, damped = by[:, :, :1, :1] * influence, by[:, :, :1, 1:2] * influence
             k, c = k + per_force * stiffer, c + per_force * (damped * frequency[:, None, None])
-            held = by[:, :, :1, 2:] * memory.unit[:, None]
-            a = a.at[:, :, n : 2 * n, first:last].set(-per_force * held / unit[:, None, None])
-            over = memory.unit[:, :, None]
+            by_states = by[:, :, :1, 2:] * law.unit[:, None]
+            a = a.at[:, :, n : 2 * n, first:last].set(-per_force * by_states / unit[:, None, None])
+            over = law.unit[:, :, None]
             per_phase = 1 / frequency[:, None, None]
-            a = a.at[:, :, first:last, :n].set(by[:, :, 1:, :1] / over * row * per_phase)
-            follows = by[:, :, 1:, 1:2] / over * row * unit[:, None, None]
+            a = a.at[:, :, first:last, :n].set(by[:, :, 1:, :1] / over * influence * per_phase)
+            follows = by[:, :, 1:, 1:2] / over * influence * unit[:, None, None]
             a = a.at[:, :, first:last, n : 2 * n].set(follows)
-            fades = by[:, :, 1:, 2:] / over * memory.unit[:, None] * per_phase
+            fades = by[:, :, 1:, 2:] / over * law.unit[:, None] * per_phase
             a = a.at[:, :, first:last, first:last].set(fades)
             first = last
         modes = np.arange(n)
@@ -250,45 +257,45 @@ def _by_magnus(
     def advance(state: tuple, item: tuple) -> tuple[tuple, None]:
         y, z = state
         propagator, stuck = item
-        if not n_places:
+        if not n_attachments:
             return (propagator @ y, z), None
-        held_by = jnp.where(stuck, friction.stiffness, 0.0)[:, :, None] * z
-        pull = of_place.T @ held_by
-        y = propagator[:, :own, :own] @ y + propagator[:, :own, own:] @ pull
+        slider_force = jnp.where(stuck, friction.stiffness, 0.0)[:, :, None] * z
+        force = of_attachment.T @ slider_force
+        y = propagator[:, :own, :own] @ y + propagator[:, :own, own:] @ force
         return (y, jnp.where(stuck[:, :, None], z, sliding(y))), None
 
     def segment(number: Array, state: tuple) -> tuple:
         ends = _step_ends(number * _SEGMENT + jnp.arange(_SEGMENT + 1), step, contacts)
-        held = ~friction.slip.dragged(0.5 * (ends[1:] + ends[:-1]))
+        stuck = ~friction.slip.slipping(0.5 * (ends[1:] + ends[:-1]))
         length = ends[1:] - ends[:-1]
         gauss = (ends[:-1, None] + length[:, None] * _GAUSS[:, None]).reshape(-1, n_points)
-        a = generators(gauss, jnp.repeat(held, 3, axis=0))
+        a = generators(gauss, jnp.repeat(stuck, 3, axis=0))
         a = a.reshape(_SEGMENT, 3, n_points, size, size)
-        return jax.lax.scan(advance, state, (_magnus(a, length[..., None, None]), held))[0]
+        return jax.lax.scan(advance, state, (_magnus(a, length[..., None, None]), stuck))[0]
 
     def piece(number: Array, state: tuple) -> tuple:
         begin, end = edges[number], edges[number + 1]
         middle = 0.5 * (begin + end)[None]
-        held = ~friction.slip.dragged(middle)
+        stuck = ~friction.slip.slipping(middle)
         length = (end - begin)[:, None, None]
-        propagator = _long_exponential(generators(middle, held)[0] * length)
-        return advance(state, (propagator, held[0]))[0]
+        propagator = _long_exponential(generators(middle, stuck)[0] * length)
+        return advance(state, (propagator, stuck[0]))[0]
 
     def sliding(y: Array) -> Array:
-        """The motion of every slider's place."""
-        there = places.displacement(jnp.swapaxes(y[:, :n], 1, 2))
-        return jnp.swapaxes(there, 1, 2)[:, owner]
+        """The motion of every slider's attachment point."""
+        local = attachments.displacement(jnp.swapaxes(y[:, :n], 1, 2))
+        return jnp.swapaxes(local, 1, 2)[:, owner]
 
-    # Sliders at the first place follow from its motion; others have positions of their own.
+    # Sliders at the first attachment point follow its motion; the others have own positions.
     free = np.flatnonzero(owner > 0)
     y = jnp.broadcast_to(jnp.eye(own, own + free.size), (n_points, own, own + free.size))
     z = jnp.zeros((n_points, owner.size, own + free.size))
     slips = friction.slip.slips[:, :, None]
-    if n_places:
+    if n_attachments:
         start = sliding(y).at[:, free].set(np.eye(own + free.size)[own:])
         z = jnp.where(slips, start, 0.0)
     if in_pieces:
-        # Behind the last contact of a motion there are pieces of no length.
+        # After the last event of a motion the intervals have zero length.
         inside = jnp.where(jnp.isfinite(contacts), jnp.mod(contacts, 2 * jnp.pi), 2 * jnp.pi)
         edges = jnp.pad(jnp.sort(inside, axis=0), ((1, 0), (0, 0)))
         edges = jnp.pad(edges, ((0, 1), (0, 0)), constant_values=2 * jnp.pi)
@@ -297,7 +304,7 @@ def _by_magnus(
         return jnp.concatenate([y, jnp.where(slips, z, 0.0)[:, free]], axis=1)
     phases = 2 * jnp.pi * jnp.arange(48)[:, None] / 48
     k, c = _tangents(model, friction, coefficients, frequency, phases)
-    hidden = sum((memory.stiffness() for memory in friction.memories), jnp.zeros(()))
+    hidden = sum((law.stiffness() for law in friction.internal), jnp.zeros(()))
     hidden = hidden / (terms.mass * frequency[:, None] ** 2)[..., None]
     rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k) + jnp.abs(hidden), axis=-1)))
     cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(jnp.sum(jnp.abs(c), axis=-1))))
@@ -308,7 +315,7 @@ def _by_magnus(
 
 
 def _is_piecewise_linear(model: Structure) -> bool:
-    """Whether a structure is linear from one contact or slip to the next."""
+    """Whether a structure is linear between contact and slip events."""
     straight = all(isinstance(e, AbstractNonsmooth) and e.is_straight for e in model.memoryless)
     sliders = all(isinstance(e, AbstractSliders) for e in model.hysteretic)
     return straight and sliders and not model.potential.monomials
@@ -317,34 +324,34 @@ def _is_piecewise_linear(model: Structure) -> bool:
 def _contacts(
     model: Structure, coefficients: Array, frequency: Array, friction: Friction
 ) -> Float[Array, "contact point"]:
-    """Phases behind the beginning at which contacts open and close, and laws with a memory turn.
+    """Phases after the start at which contacts open or close, and friction laws reverse.
 
-    Infinite where there are fewer.
+    Infinite if there are fewer.
     """
     tau = 2 * jnp.pi * jnp.arange(SAMPLES) / SAMPLES
     phases = friction.begin + tau[:, None]
     q, _ = states_at(coefficients, frequency, phases)
-    found = [jnp.zeros((0, len(frequency)))]
+    contacts = [jnp.zeros((0, len(frequency)))]
 
-    def add(x: Array, place: Array, start: Array | float = 0.0) -> None:
-        there = jax.vmap(crossings, (1, None), 1)(x, place)
-        phase = jnp.mod((there.interval + there.fraction) * tau[1] - start, 2 * jnp.pi)
-        found.append(jnp.where(there.passes, phase, jnp.inf))
+    def add(x: Array, threshold: Array, start: Array | float = 0.0) -> None:
+        crossing = jax.vmap(crossings, (1, None), 1)(x, threshold)
+        phase = jnp.mod((crossing.interval + crossing.fraction) * tau[1] - start, 2 * jnp.pi)
+        contacts.append(jnp.where(crossing.valid, phase, jnp.inf))
 
     for effect in model.memoryless:
         if isinstance(effect, AbstractNonsmooth):
             x = elements_of([effect], model.modes).displacement(q)[..., 0]
-            for place in effect.nonsmooth_points().displacement:
-                add(x, place)
-    for memory in friction.memories:
-        add(memory.rate, jnp.zeros(()), friction.begin)
-    return jnp.concatenate(found)
+            for threshold in effect.nonsmooth_points().displacement:
+                add(x, threshold)
+    for law in friction.internal:
+        add(law.rate, jnp.zeros(()), friction.begin)
+    return jnp.concatenate(contacts)
 
 
 def _step_ends(number: Array, step: Array, contacts: Array) -> Float[Array, "end point"]:
-    """Phases at the ends of steps: equally spaced, the nearest to each contact moved onto it.
+    """Phases at the ends of steps: equally spaced, the nearest to each event moved onto it.
 
-    No step then holds a jump of the stiffness but one of two contacts closer than half a step.
+    The stiffness then jumps within a step only where two events are closer than half a step.
     """
     even = number * step
     if not len(contacts):
@@ -366,11 +373,11 @@ def _magnus(
 
     first, middle, last = (step * generators[:, i] for i in range(3))
     slope = np.sqrt(15.0) / 3.0 * (last - first)
-    bend = 10.0 / 3.0 * (last - 2 * middle + first)
+    curvature = 10.0 / 3.0 * (last - 2 * middle + first)
     inner = bracket(middle, slope)
-    outer = -bracket(middle, 2 * bend + inner) / 60.0
-    exponent = middle + bend / 12.0
-    exponent = exponent + bracket(-20.0 * middle - bend + inner, slope + outer) / 240.0
+    outer = -bracket(middle, 2 * curvature + inner) / 60.0
+    exponent = middle + curvature / 12.0
+    exponent = exponent + bracket(-20.0 * middle - curvature + inner, slope + outer) / 240.0
     return _exponential(exponent)
 
 
@@ -388,11 +395,11 @@ def _exponential(matrix: Float[Array, "*batch state state"]) -> Float[Array, "*b
 
 
 def _long_exponential(matrix: Float[Array, "point state state"]) -> Array:
-    """e^M of any size: that of M/2^k, squared k times."""
-    size = jnp.nan_to_num(jnp.max(jnp.sum(jnp.abs(matrix), axis=-1)), posinf=0.0)
-    doublings = jnp.ceil(jnp.log2(jnp.maximum(size, 1.0))).astype(int)
+    """e^M of any norm: that of M/2^k, squared k times."""
+    norm = jnp.nan_to_num(jnp.max(jnp.sum(jnp.abs(matrix), axis=-1)), posinf=0.0)
+    doublings = jnp.ceil(jnp.log2(jnp.maximum(norm, 1.0))).astype(int)
     short = _exponential(matrix * 0.5**doublings)
-    return jax.lax.fori_loop(0, doublings, lambda _, found: found @ found, short)
+    return jax.lax.fori_loop(0, doublings, lambda _, power: power @ power, short)
 
 
 def _tangents(
@@ -405,8 +412,8 @@ def _tangents(
     k, c = model.slopes(q.reshape(-1, n), v.reshape(-1, n))
     k = k.reshape(*q.shape, n) + jnp.diag(terms.stiffness) + friction.stuck
     c = c.reshape(*q.shape, n) + terms.damping_matrix()
-    for effect, there in friction.viscous:
-        x, rate = there.displacement(q)[..., 0], there.displacement(v)[..., 0]
-        c = c + there.matrix(viscous_slope(effect, x, rate)[..., None])
+    for effect, attachment in friction.viscous:
+        x, rate = attachment.displacement(q)[..., 0], attachment.displacement(v)[..., 0]
+        c = c + attachment.matrix(viscous_slope(effect, x, rate)[..., None])
     per_mass = (terms.mass * frequency[:, None])[:, :, None]
     return k / (per_mass * frequency[:, None, None]), c / per_mass

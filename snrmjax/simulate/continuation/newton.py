@@ -1,4 +1,4 @@
-"""Newton's method across a direction: one step at a time, alone or side by side."""
+"""Newton's method in a hyperplane, one step at a time, for one problem or a batch."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -17,64 +17,64 @@ Linearised = Callable[[Point], tuple[Float[Array, " equation"], Float[Array, "eq
 
 
 @jax.custom_batching.custom_vmap
-def solved_behind(
+def solve_appended(
     columns: Float[Array, "column equation"],
 ) -> Float[Array, "right equation"]:
-    """The solutions for the right-hand sides that stand behind the columns of a square matrix."""
+    """Solve for the right-hand sides appended to the columns of a square matrix."""
     size = columns.shape[1]
-    # The columns behind the square part come out multiplied by the inverse of L.
+    # LU returns the appended columns multiplied by the inverse of L.
     factors = jax.lax.linalg.lu(columns.T)[0]
     return jax.lax.linalg.triangular_solve(
         factors[:, :size], factors[:, size:], left_side=True, lower=False
     ).T
 
 
-@solved_behind.def_vmap
-def _solved_side_by_side(count: int, batched: list[bool], columns: Array) -> tuple[Array, bool]:
+@solve_appended.def_vmap
+def _solve_appended_batch(count: int, batched: list[bool], columns: Array) -> tuple[Array, bool]:
     """One after the other on a CPU.
 
-    A factorisation of many matrices at once spreads over the threads of a pool and waits for them:
-    called from as many threads itself, it waits for ever (jaxlib 0.10).
+    A batched factorisation is distributed over a thread pool and waits for it: called from as many
+    threads, it deadlocks (jaxlib 0.10).
     """
     if on_accelerator():
-        return jax.vmap(solved_behind.fun)(columns), True
-    return jax.lax.map(solved_behind, columns), True
+        return jax.vmap(solve_appended.fun)(columns), True
+    return jax.lax.map(solve_appended, columns), True
 
 
 class Trial(NamedTuple):
-    """A correction under way: Newton's method in the hyperplane through `start` across `across`."""
+    """State of a Newton correction in the hyperplane through `start` normal to `across`."""
 
     start: Point
     across: Point
     point: Point  # the last iterate
-    tangent: Point  # of unit length, along `across`, at the iterate before
+    tangent: Point  # of unit length, along `across`, at the previous iterate
     n_solves: Int[Array, ""]
     converged: Bool[Array, ""]
     finite: Bool[Array, ""]
 
     @classmethod
     def at(cls, start: Point, across: Point) -> "Trial":
-        """A correction that is to begin."""
+        """The state before the first step."""
         yes = jnp.array(True)
         return cls(start, across, start, across, jnp.array(0), ~yes, yes)
 
     def goes_on(self, iterations: Number) -> Bool[Array, ""]:
-        """Whether another step of Newton's method is wanted."""
+        """Whether to take another Newton step."""
         return self.finite & ~self.converged & (self.n_solves < iterations)
 
     def stepped(self, linearised: Linearised, tolerance: Number) -> "Trial":
-        """After one step of Newton's method.
+        """The state after one Newton step.
 
         One LU factorisation of the bordered matrix, with both right-hand sides as further columns,
-        gives the step and the tangent. Converged when the error that is left falls below
-        `tolerance`; it is judged by the last step times what that step left of the residual.
+        yields the step and the tangent. Converged when the remaining error is below `tolerance`;
+        it is estimated as the last step times its reduction of the residual.
         """
         size = self.start.shape[0]
         residual, jacobian = linearised(self.point)
         ahead = self.across @ (self.point - self.start)
         border = jnp.concatenate([self.across, jnp.stack([ahead, 1.0])])
         columns = jnp.concatenate([jacobian.T, residual[None], jnp.zeros((1, size - 1))])
-        change, tangent = solved_behind(jnp.concatenate([columns, border[:, None]], axis=1))
+        change, tangent = solve_appended(jnp.concatenate([columns, border[:, None]], axis=1))
         new, step = self.point - change, jnp.max(jnp.abs(change))
         left = jnp.max(jnp.abs(linearised(new)[0])) / jnp.max(jnp.abs(residual))
         done = (step <= tolerance) | ((step * left <= tolerance) & (step < 0.1))
@@ -94,7 +94,7 @@ def correct(
     tolerance: Number,
     iterations: Number,
 ) -> Trial:
-    """Newton's method in the hyperplane through `start` across `direction`, to its end."""
+    """Newton's method in the hyperplane through `start` normal to `direction`."""
     return jax.lax.while_loop(
         lambda trial: trial.goes_on(iterations),
         lambda trial: trial.stepped(linearised, tolerance),
@@ -103,5 +103,5 @@ def correct(
 
 
 def chosen(yes: Bool[Array, ""], first: T, second: T) -> T:
-    """One of two states of one kind."""
+    """The first state if `yes`, else the second."""
     return jax.tree.map(lambda a, b: jnp.where(yes, a, b), first, second)

@@ -30,11 +30,11 @@ from snrmjax.simulate.continuation.stability import (
     stability_of,
 )
 
-_NARROW = 1e-4  # relative width of a gap between stable points that is no step's
+_NARROW = 1e-4  # relative width of a gap in stability that exceeds a step of the curve
 
 
 class MotionCurve(AbstractResult):
-    """Periodic motions in order along a curve."""
+    """Periodic motions in sequence along a curve."""
 
     coordinates: ClassVar[tuple[str, ...]] = ("sensor", "frequency_hz")
 
@@ -43,18 +43,18 @@ class MotionCurve(AbstractResult):
     frequency: Float[np.ndarray, " point"] = quantity("point", "Hz", "frequency")
     status: CurveStatus = setting()
     sensors: tuple[str, ...] = quantity("sensor", "", "sensor", name="sensor", static=True)
-    # Where a base drives it, "forces" are its accelerations and velocities relative to it.
+    # With base excitation "forces" are its accelerations, and velocities are relative to it.
     base: BaseMotion | None = eqx.field(static=True, default=None, kw_only=True)
-    # Where an unbalance U (kg m) drives it, by the force c U Ω², "forces" are the numbers c.
+    # With an unbalance U (kg m) and the force c U Ω², "forces" are the factors c.
     unbalance: float | None = eqx.field(static=True, default=None, kw_only=True)
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives it: newtons, m/s² of a base, or a number of unbalances."""
+        """Unit of the excitation: newtons, m/s² of a base, or a number of unbalances."""
         return drive_unit(self.base, self.unbalance)
 
     def variables(self) -> dict[str, Variable]:
-        """The quantities of the curve, and its velocities by the names of the files' columns."""
+        """The quantities of the curve, and its velocities under the column names of files."""
         return {**super().variables(), **fundamental_variables(self.velocity)}
 
     def point(self, k: int) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +63,7 @@ class MotionCurve(AbstractResult):
 
 
 def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknown"]) -> dict:
-    """What a `MotionCurve` has of scaled points: frequency, coefficients, velocity, sensors."""
+    """The fields of a `MotionCurve` from scaled points: frequency, coefficients, velocity, …"""
     coefficients, frequency = balance.motions(points)
     modes = balance.model.modes
     whole = with_sines(coefficients) if balance.cosine_only else coefficients
@@ -76,7 +76,7 @@ def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknow
 def velocity_at_sensors(
     curve: MotionCurve, force: float | Float[np.ndarray, " point"]
 ) -> Complex[np.ndarray, "point harmonic sensor"]:
-    """Velocities as the sensors record them, m/s: with the base's own where they see it too.
+    """Velocities as the sensors record them, m/s: plus that of the base where it is recorded.
 
     Arguments: `force` (N), or the acceleration of the base (m/s²), of the points.
     """
@@ -101,20 +101,20 @@ class Branch(StrEnum):
 
 
 class ResponseCurve(MotionCurve):
-    """One forced response in order along the curve, unstable parts included.
+    """A forced response curve, unstable parts included.
 
-    `truncation` estimates the share of the velocity that the harmonics left out would have: a
-    curve on which it exceeds a few per cent wants more harmonics. Without stability
-    `multipliers` and `truncation` are None, and the stability of every point is `NOT_COMPUTED`.
+    `truncation` estimates the relative velocity of the truncated harmonics: above a few per cent
+    raise the harmonic order. Without stability `multipliers` and `truncation` are None, and the
+    stability of every point is `NOT_COMPUTED`.
     """
 
     force: float = setting()  # N
     event: tuple[CurveEvent, ...] = quantity(  # see `forced_response`
         "point", "", "what happens there", static=True
     )
-    multipliers: Complex[np.ndarray, "point multiplier"] | None = None  # None: not asked for
+    multipliers: Complex[np.ndarray, "point multiplier"] | None = None  # None: not requested
     truncation: Float[np.ndarray, " point"] | None = None  # estimated, like `multipliers`
-    # Kinds of events that are there but were not located.
+    # Kinds of events that were detected but not located.
     not_located: tuple[str, ...] = setting(default=())
     branch: Branch = setting(default=Branch.MAIN)
     n_solves: int = setting(default=0)  # linear systems factorised to trace the curve
@@ -170,13 +170,13 @@ class ResponseCurve(MotionCurve):
             at, self.stability, "1", "1 stable, 0 unstable, -1 not computed"
         )
         if self.truncation is not None:
-            text = "estimated share of the velocity in harmonics left out"
+            text = "estimated relative velocity of the truncated harmonics"
             named["truncation"] = Variable(at, self.truncation, "1", text)
         return named
 
 
 def _counted(kinds: Iterable[str]) -> str:
-    """How often each kind comes, once for many and once for one: "2 folds, 1 peak"."""
+    """Counts of each kind as text: "2 fold, 1 peak"."""
     each = [(kind.replace("_", " "), n) for kind, n in Counter(kinds).items()]
     return ", ".join(f"{n} {kind}" for kind, n in each)
 
@@ -189,7 +189,7 @@ def assembled(
     stability: bool = True,
     branch: Branch = Branch.MAIN,
 ) -> list[ResponseCurve]:
-    """Curves with their events and bifurcations inserted, velocities and multipliers.
+    """Response curves with events and bifurcations inserted, velocities and multipliers.
 
     Arguments: `balances` stacked, one for every curve; `steps` with which they were traced.
     """
@@ -228,7 +228,7 @@ def _of_points(
     balances: HarmonicBalance,
     curves: list[TracedCurve],
 ) -> list[np.ndarray]:
-    """Numbers of every point of many curves, asked for at once."""
+    """Values at every point of many curves, computed in one call."""
     counts = [len(curve.points) for curve in curves]
     owner = np.repeat(np.arange(len(curves)), counts)
     rows = numbers(balances, owner, np.concatenate([curve.points for curve in curves]))
@@ -259,8 +259,8 @@ def without_stable_response(
 ) -> list[tuple[float, float]]:
     """Parts of a range (rad/s) in which no curve has a stable point.
 
-    Sweeps leave the curves there: for a response that no curve shows, or for none of the force's
-    period. Empty where the stability of a point is not known.
+    There a sweep settles on a response of no known curve, or on one that does not have the period
+    of the force. Empty if the stability of any point is not known.
     """
     if any(np.any(curve.stability == int(Stability.NOT_COMPUTED)) for curve in curves):
         return []

@@ -14,13 +14,13 @@ from snrmjax.simulate.continuation.left_out_harmonics import completed_motions, 
 from snrmjax.simulate.continuation.monodromy import monodromy
 
 STEPS_PER_CYCLE = 6  # of the fastest tangent frequency
-MARGIN = 1e-6  # beyond the unit circle: what the multipliers of a conservative motion may err by
+MARGIN = 1e-6  # beyond the unit circle: numerical error of conservative multipliers
 
 
 class Stability(IntEnum):
-    """Whether a periodic motion is stable: what a small disturbance does to it."""
+    """Stability of a periodic motion against small disturbances."""
 
-    NOT_COMPUTED = -1  # not asked for, or the multipliers could not be computed
+    NOT_COMPUTED = -1  # not requested, or the multipliers could not be computed
     UNSTABLE = 0
     STABLE = 1
 
@@ -39,13 +39,13 @@ def floquet_multipliers(
     Integrates m δq̈ + C(t)δq̇ + K(t)δq = 0 with the tangent matrices along the motion, by methods
     that keep a conservative structure's multipliers on the unit circle, however light the
     damping (see `monodromy`): kicked oscillators, of order 4, for springs and a potential; exact
-    pieces between slips and contacts where nothing else is nonlinear; Magnus' method of order 6
-    for all others. Sliders are linearised as they are: dragged or stuck. A motion is stable when
-    all multipliers lie inside the unit circle.
+    intervals between slip and contact events where nothing else is nonlinear; Magnus' method of
+    order 6 for all others. Sliders are linearised in their current state, slipping or stuck. A
+    motion is stable when all multipliers lie inside the unit circle.
 
     Arguments: Fourier coefficients (kg^1/2 m) of the structure as simulated, `frequency` in
-    rad/s, `steps_per_cycle` of the fastest tangent frequency. Points are worked on in blocks of
-    one size, so that neither their number nor that of the steps compiles anew.
+    rad/s, `steps_per_cycle` of the fastest tangent frequency. Points are computed in blocks of
+    one size, so that neither their number nor that of the steps recompiles.
     Returns NaN for points that are not finite, and where more than 8192 steps would be needed.
     Not differentiable; the motion itself is: `snrmjax.simulate.periodic_motion`.
     """
@@ -58,9 +58,9 @@ def floquet_multipliers(
 def many_multipliers(
     balances: HarmonicBalance, owner: np.ndarray, points: Float[np.ndarray, "point unknown"]
 ) -> Complex[np.ndarray, "point multiplier"]:
-    """Floquet multipliers of scaled points of several structures: `owner` says of which.
+    """Floquet multipliers of scaled points of several structures, whose indices are `owner`.
 
-    With contacts or friction they are those of the motions with twice the harmonics.
+    With contacts or friction the motions are first solved with twice the harmonics.
     """
     whole = has_contacts(balances.model) and len(points) > 0
     motions = (
@@ -76,14 +76,14 @@ def _multipliers(
     frequency: np.ndarray,
     steps_per_cycle: float,
 ) -> Complex[np.ndarray, "point multiplier"]:
-    found = np.full((len(owner), 2 * models.n_modes), np.nan, dtype=np.complex128)
-    # The steps of points side by side are as many as one of them needs.
+    multipliers = np.full((len(owner), 2 * models.n_modes), np.nan, dtype=np.complex128)
+    # All points of a batch take as many steps as the most demanding one.
     known = np.all(np.isfinite(coefficients), axis=(1, 2)) & np.isfinite(frequency)
     if known.any():
         steps, rows = np.array(float(steps_per_cycle)), (coefficients[known], frequency[known])
         maps = by_member(lambda *given: _monodromies(*given, steps), models, owner[known], *rows)
-        found[known] = _eigenvalues(maps, found.shape[1])
-    return found
+        multipliers[known] = _eigenvalues(maps, multipliers.shape[1])
+    return multipliers
 
 
 @partial(compiled, long_loops=True)
@@ -102,16 +102,16 @@ def _monodromies(
 def _eigenvalues(
     maps: Float[np.ndarray, "*batch state state"], number: int
 ) -> Complex[np.ndarray, "*batch multiplier"]:
-    """The largest eigenvalues of maps, NaN of those that are not finite.
+    """The largest eigenvalues of maps, NaN for maps that are not finite.
 
-    States beyond `number` are positions of sliders, which the motion sets anew in each period.
+    States beyond `number` are slider positions, which the motion resets in each period.
     """
     finite = np.all(np.isfinite(maps), axis=(-2, -1))[..., None]
-    found: np.ndarray = np.linalg.eigvals(np.where(finite[..., None], maps, 0.0))
-    if found.shape[-1] > number:
-        largest = np.argsort(-np.abs(found), axis=-1)[..., :number]
-        found = np.take_along_axis(found, largest, axis=-1)
-    return np.where(finite, found, np.nan)
+    values: np.ndarray = np.linalg.eigvals(np.where(finite[..., None], maps, 0.0))
+    if values.shape[-1] > number:
+        largest = np.argsort(-np.abs(values), axis=-1)[..., :number]
+        values = np.take_along_axis(values, largest, axis=-1)
+    return np.where(finite, values, np.nan)
 
 
 def stability_of(
@@ -119,7 +119,7 @@ def stability_of(
 ) -> Int[np.ndarray, "*batch"]:
     """A `Stability` for every motion: stable when all its multipliers are inside the unit circle.
 
-    On the circle but for rounding counts as inside; multipliers of NaN were not computed.
+    On the circle to rounding counts as inside; NaN multipliers were not computed.
     """
     largest = np.max(np.abs(multipliers), axis=-1)
     known = np.where(largest < 1.0 + MARGIN, int(Stability.STABLE), int(Stability.UNSTABLE))

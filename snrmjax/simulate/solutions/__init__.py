@@ -1,1 +1,1 @@
-"""What a structure does: forced responses, normal modes, controlled and settled motions."""
+"""Steady motions: forced responses, normal modes, controlled and quasi-periodic motions."""

@@ -16,7 +16,7 @@ from snrmjax.numerics.result import quantity
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
-    averaged_at_places,
+    averaged_at_attachments,
     harmonic_balance,
     linear_coefficients,
     resonance_displacement,
@@ -35,8 +35,8 @@ from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 from snrmjax.simulate.solutions.event_curves import trace_events
 
 DEFAULT_STEPS = StepControl(max_points=2000)
-_SMALL = 0.01  # of the largest amplitude or force: where a curve begins
-_PASSES = 8  # in which shape and averages of a small motion agree
+_SMALL = 0.01  # start of a curve, as a fraction of the largest amplitude or force
+_PASSES = 8  # iterations between mode shape and averaged forces of a small motion
 
 
 class DampedModeBranch(MotionCurve):
@@ -74,12 +74,12 @@ def damped_normal_mode(
     """The damped nonlinear mode by the extended periodic motion concept.
 
     Solves m q̈ + (C − ξ m) q̇ + K q + f(q, q̇) = 0 for periodic motions: a negative damping ξ,
-    proportional to mass, makes up for what the structure dissipates over a cycle, so that its
-    damping ratio is ξ/(2Ω). Friction and every other effect take part.
+    proportional to mass, compensates the dissipation over a cycle, so that the damping ratio of
+    the mode is ξ/(2Ω). Friction and all other nonlinear elements are included.
 
-    Arguments: `largest_velocity` in m/s, of the linear mode of interest at the sensor that sees it
-    most; the curve starts at a hundredth of it and ends beyond it.
-    Returns a `DampedModeBranch` whose `status` says how it ended.
+    Arguments: `largest_velocity` in m/s, of the linear mode of interest at the sensor where it is
+    largest; the curve starts at a hundredth of it and ends beyond it.
+    Returns a `DampedModeBranch` whose `status` is how it ended.
     Raises `ValueError` for a velocity that is not positive and finite.
     Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion` with
     `condition="phase_resonance"`.
@@ -95,7 +95,7 @@ def damped_normal_mode(
     )
     start = _quasi_linear_motion(balance, _SMALL)
     curve = on_host(_trace_damped(balance, start, steps))
-    # ξ/(2Ω), both over the same natural frequency.
+    # ξ/(2Ω), both scaled by the same natural frequency.
     return DampedModeBranch(
         **motions_of(balance, np.delete(curve.points, -2, axis=1)),
         status=curve.status,
@@ -106,11 +106,10 @@ def damped_normal_mode(
 def _quasi_linear_motion(
     balance: HarmonicBalance, fraction: float
 ) -> Float[np.ndarray, " unknown"]:
-    """The mode of the structure with what averaging makes of its forces in a small motion.
+    """The mode of the structure with its nonlinear elements averaged over a small motion.
 
-    Arguments: `fraction` of the balance's scale that the mode of interest moves. Returns the
-    unknowns of `_trace_damped`: friction sticks in a small motion and changes shape, frequency
-    and damping.
+    Stuck friction changes its shape, frequency and damping. Arguments: `fraction`, the amplitude
+    of the mode of interest over the balance's scale. Returns the unknowns of `_trace_damped`.
     """
     model, j = balance.model, balance.model.modes.mode_of_interest
     terms, n = linear_terms_of(model), model.n_modes
@@ -118,22 +117,25 @@ def _quasi_linear_motion(
     damping = np.diag(np.asarray(terms.damping)) + (0 if coupled is None else np.asarray(coupled))
     stiffness = np.diag(np.asarray(terms.stiffness))
     elements = elements_of(model.forces, model.modes)
-    rows, amplitude = np.asarray(elements.rows), fraction * float(balance.displacement_scale)
+    influence, amplitude = (
+        np.asarray(elements.influence),
+        fraction * float(balance.displacement_scale),
+    )
     shape, value = np.eye(n)[j].astype(complex), 1j * float(balance.frequency_scale)
     for _ in range(_PASSES if model.forces else 1):
-        there = amplitude * np.abs(rows @ shape)
-        added = averaged_at_places(model, there, value.imag)
-        k = stiffness + rows.T @ (np.asarray(added.stiffness)[:, None] * rows)
-        c = damping + rows.T @ (np.asarray(added.damping)[:, None] * rows)
+        local = amplitude * np.abs(influence @ shape)
+        added = averaged_at_attachments(model, local, value.imag)
+        k = stiffness + influence.T @ (np.asarray(added.stiffness)[:, None] * influence)
+        c = damping + influence.T @ (np.asarray(added.damping)[:, None] * influence)
         values, shapes = np.linalg.eig(
             np.block([[np.zeros((n, n)), np.eye(n)], [-k / mass, -c / mass]])
         )
-        swings = np.flatnonzero(values.imag > 0)
-        if not swings.size:
+        oscillating = np.flatnonzero(values.imag > 0)
+        if not oscillating.size:
             break
-        parts = np.abs(shapes[:n, swings])
-        place = swings[np.argmax(parts[j] / np.linalg.norm(parts, axis=0))]
-        value, shape = values[place], shapes[:n, place] / shapes[j, place]
+        parts = np.abs(shapes[:n, oscillating])
+        best = oscillating[np.argmax(parts[j] / np.linalg.norm(parts, axis=0))]
+        value, shape = values[best], shapes[:n, best] / shapes[j, best]
     frequency, unit = abs(value), float(balance.frequency_scale)
     x = np.zeros((balance.n_coefficients, n))
     x[1], x[2] = fraction * shape.real, -fraction * shape.imag
@@ -147,15 +149,15 @@ def _trace_damped(
     model, j, n = balance.model, balance.model.modes.mode_of_interest, balance.model.n_modes
     terms = model.linear_terms()
     basis = harmonic_basis(balance.harmonic_order, balance.n_samples)
-    turn = jnp.kron(jnp.asarray(basis.derivative), jnp.diag(terms.mass))
+    derivative = jnp.kron(jnp.asarray(basis.derivative), jnp.diag(terms.mass))
     sine = 2 * n + j
 
     def linearised(point: Array) -> tuple[Array, Array]:
-        """Unknowns x, ξ/ω₀ and Ω/ω₀; the last equation sets the phase."""
+        """Unknowns x, ξ/ω₀ and Ω/ω₀; the last equation is the phase condition."""
         x, excitation, omega = point[:-2], point[-2], point[-1]
         residual, jacobian = balance.linearised(jnp.append(x, omega))
-        slope = turn @ x
-        by_x = jacobian[:, :-1] - excitation * omega * turn
+        slope = derivative @ x
+        by_x = jacobian[:, :-1] - excitation * omega * derivative
         by_omega = jacobian[:, -1] - excitation * slope
         top = jnp.concatenate([by_x, (-omega * slope)[:, None], by_omega[:, None]], axis=1)
         phase = jnp.zeros(point.shape[0]).at[sine].set(1.0)
@@ -179,13 +181,13 @@ def phase_controlled(
 ) -> ControlledCurve:
     """Phase resonances of the mode of interest under a rising force.
 
-    The velocity is in phase with the force: the force-appropriated backbone, what a phase-locked
-    loop tracks, unstable states of the open loop included. It is the curve that `follow_event`
-    follows from a phase resonance, begun at a small force.
+    The velocity is in phase with the force: the force-appropriated backbone that a phase-locked
+    loop tracks, including states that are unstable in open loop. It is the curve that
+    `follow_event` traces from a phase resonance, started at a small force.
 
     Arguments: `largest_force` in N; the curve starts at a hundredth of it.
     Returns a `ControlledCurve`; its `status` is UPPER_END when the largest force was reached.
-    Raises `ValueError` for a force that is not positive or does not move the mode of interest.
+    Raises `ValueError` for a force that is not positive or does not drive the mode of interest.
     Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion`.
     Reference: Peeters, Kerschen & Golinval, J. Sound Vib. 330 (2011) 486,
     doi:10.1016/j.jsv.2010.08.028.
@@ -193,7 +195,9 @@ def phase_controlled(
     positive("largest_force", largest_force)
     model = simulated_structure(model)
     if not model.modes.driven()[model.modes.mode_of_interest]:
-        raise ValueError("the force does not move the mode of interest: it has no phase to hold.")
+        raise ValueError(
+            "the force does not drive the mode of interest, which has no phase to control."
+        )
     balance = harmonic_balance(
         model,
         largest_force,
@@ -235,13 +239,13 @@ def response_controlled(
 ) -> ControlledCurve:
     """Steady states of a given velocity amplitude through a frequency range.
 
-    The controller holds |V₁| at the first sensor and adjusts the force; such curves have no
-    folds where the open loop has them. Solves the harmonic balance with |V₁| = `velocity`.
+    The controller keeps |V₁| at the first sensor constant by adjusting the force, which removes
+    the folds of the open loop. Solves the harmonic balance with |V₁| = `velocity`.
 
     Arguments: `velocity` in m/s, frequencies in rad/s.
     Returns a `ControlledCurve` from the lower to the upper frequency, traced from the upper one
-    where the lower one gives no start; its `status` is UPPER_END when it spans the range.
-    Raises `ValueError` for a velocity that is not positive and an empty range.
+    if the lower one gives no start; its `status` is UPPER_END when it spans the range.
+    Raises `ValueError` for a velocity that is not positive and for an empty range.
     Not differentiable: differentiate single motions: `snrmjax.simulate.periodic_motion` with
     `condition="velocity"`.
     Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
@@ -256,7 +260,7 @@ def response_controlled(
         raise ValueError("the first sensor does not see the mode of interest.")
     middle = 0.5 * (from_frequency + to_frequency)
     scale = velocity / (abs(shape[j]) * middle)
-    # The unit of the unknown force: what a linear mode would need at half its resonance.
+    # Unit of the unknown force: a tenth of the static force for this displacement.
     terms = model.linear_terms()
     unit = float(terms.stiffness[j] * scale / np.abs(model.modes.participation[j])) * 0.1
     balance = harmonic_balance(
@@ -264,7 +268,7 @@ def response_controlled(
     )
     curve = on_host(_trace_response(balance, float(velocity), ends, np.array(False), steps))
     if curve.status == CurveStatus.NO_START:
-        # Far below a resonance the linear response may be no start where far above it is one.
+        # The linear response may be no start far below a resonance, but one far above it.
         downward = _trace_response(balance, float(velocity), ends, np.array(True), steps)
         curve = on_host(downward).reversed()
     return ControlledCurve(
@@ -311,7 +315,7 @@ def _trace_response(
 def _with_force(
     balance: HarmonicBalance, point: Array, fraction: Array
 ) -> tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]:
-    """Residual and Jacobian under a share of the force, the last column for the share."""
+    """Residual and Jacobian under a fraction of the force, with its derivative as last column."""
     now = eqx.tree_at(lambda b: b.force, balance, balance.force * fraction)
     residual, jacobian = now.linearised(point)
     column = -balance.newtons(point[-1]) * balance.load()

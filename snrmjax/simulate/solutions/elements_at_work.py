@@ -1,4 +1,4 @@
-"""Elements that a force does not set to work: stops that are not reached, friction that holds."""
+"""Nonlinear elements that stay inactive: stops that are not reached, friction that sticks."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.model.attachment import influence_text
 from snrmjax.model.effect_base import AbstractForce, AbstractNonsmooth
 from snrmjax.model.elements import elements_of
 from snrmjax.model.library.friction import CoulombFriction, JenkinsSlider
 from snrmjax.model.moving_base import newtons
-from snrmjax.model.places import row_text
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonics import harmonic_basis
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -19,50 +19,48 @@ _SAMPLES, _FREQUENCIES = 128, 201
 
 
 class IdleElement(NamedTuple):
-    """An element whose threshold no motion of some curves reaches."""
+    """An element whose threshold no motion of the curves reaches."""
 
     element: str
-    slides: bool  # friction that sticks; else a contact that stays as it is
+    slides: bool  # a slider that sticks; else a contact that never opens or closes
     fraction: float  # of the threshold that the largest motion reaches
 
 
 class Hold(NamedTuple):
-    """Friction that holds its place still while the force is below a threshold."""
+    """Friction that sticks while the excitation force is below a threshold."""
 
     element: str
-    slides_from: float  # N, the smallest over a range of frequencies
+    slides_from: float  # N, smallest over the frequency range
 
 
 def idle_elements(model: Structure, curves: Sequence[ResponseCurve]) -> Iterator[IdleElement]:
-    """Sliders that never slip and contacts that never open or close on any of some curves."""
+    """Sliders that never slip and contacts that never open or close on any of the curves."""
     model = simulated_structure(model)
     motions = [np.asarray(curve.coefficients) for curve in curves if len(curve.frequency)]
     if not motions:
         return
-    for slider, row in _forces(model, JenkinsSlider):
-        x = np.concatenate([_over_a_period(motion @ row) for motion in motions])
+    for slider, influence in _forces(model, JenkinsSlider):
+        x = np.concatenate([_over_a_period(motion @ influence) for motion in motions])
         reach = float(np.max(0.5 * np.ptp(x, axis=1)))
         fraction = reach / float(slider.slip_displacement)
         if fraction < 1:
             yield IdleElement(_name(slider), True, fraction)
-    for contact, row in _forces(model, AbstractNonsmooth):
-        x = np.concatenate([_over_a_period(motion @ row) for motion in motions])
-        nonsmooth_points = np.atleast_1d(np.asarray(contact.nonsmooth_points().displacement))
-        if np.any(nonsmooth_points == 0):  # passed by every motion
+    for contact, influence in _forces(model, AbstractNonsmooth):
+        x = np.concatenate([_over_a_period(motion @ influence) for motion in motions])
+        thresholds = np.atleast_1d(np.asarray(contact.nonsmooth_points().displacement))
+        if np.any(thresholds == 0):  # crossed by every motion
             continue
-        fraction = float(
-            np.max(np.where(nonsmooth_points > 0, x.max(), x.min()) / nonsmooth_points)
-        )
+        fraction = float(np.max(np.where(thresholds > 0, x.max(), x.min()) / thresholds))
         if fraction < 1:
             yield IdleElement(_name(contact), False, fraction)
 
 
 def friction_hold(model: Structure, from_frequency: float, to_frequency: float) -> Hold | None:
-    """The friction that holds up to the smallest force, and that force.
+    """The friction element that slides first, and the excitation force at which it does.
 
-    While friction at a place with the row r over the modes holds it still, the rest moves linearly
-    and the friction force is (Σ r φᵀb F/d)/(Σ r²/d), d being the modal dynamic stiffnesses. It
-    slides where that exceeds the friction force.
+    While friction with the influence vector r sticks, the structure is linear and the reaction is
+    (Σ r φᵀb F/d)/(Σ r²/d), d being the modal dynamic stiffnesses. It slides when the reaction
+    exceeds the friction force.
 
     Arguments: frequencies in rad/s. Returns None for a model without dry friction.
     """
@@ -72,23 +70,23 @@ def friction_hold(model: Structure, from_frequency: float, to_frequency: float) 
     dynamic = np.asarray(terms.stiffness) - omega**2 * np.asarray(terms.mass)
     dynamic = dynamic + 1j * omega * np.asarray(terms.damping)
     holds = []
-    for friction, row in _forces(model, CoulombFriction):
+    for friction, influence in _forces(model, CoulombFriction):
         free = (newtons(model.modes.unbalance, omega, 1.0) / dynamic) @ (
-            row * np.asarray(model.modes.participation)
+            influence * np.asarray(model.modes.participation)
         )
-        held = np.abs(free / ((1 / dynamic) @ row**2))
-        if held.max() > 0:
-            holds.append(Hold(_name(friction), float(friction.force) / float(held.max())))
+        reaction = np.abs(free / ((1 / dynamic) @ influence**2))
+        if reaction.max() > 0:
+            holds.append(Hold(_name(friction), float(friction.force) / float(reaction.max())))
     return min(holds, key=lambda one: one.slides_from, default=None)
 
 
 def _forces(model: Structure, kind: Any) -> Iterator[tuple[Any, Float[np.ndarray, " mode"]]]:
-    """The forces of a kind that act on one displacement x = row·q, and these rows."""
+    """The forces of a kind that act on one displacement x = r·q, and their influence vectors r."""
     for effect in model.effects:
         if isinstance(effect, kind) and len(effect.rows) == 1:
             elements = elements_of([effect], model.modes)
             own = elements.own is not None
-            yield effect, model.own_mode if own else np.asarray(elements.rows)[0]
+            yield effect, model.own_mode if own else np.asarray(elements.influence)[0]
 
 
 def _over_a_period(x: Float[np.ndarray, "point coefficient"]) -> Float[np.ndarray, "point time"]:
@@ -97,4 +95,4 @@ def _over_a_period(x: Float[np.ndarray, "point coefficient"]) -> Float[np.ndarra
 
 def _name(effect: AbstractForce) -> str:
     (row,) = effect.rows
-    return effect.kind.replace("_", " ") + ("" if row is None else f" at {row_text(row)}")
+    return effect.kind.replace("_", " ") + ("" if row is None else f" at {influence_text(row)}")

@@ -1,4 +1,4 @@
-"""Events of forced responses followed in a second parameter: folds, resonances, bifurcations."""
+"""Events of forced responses continued in a second parameter: folds, peaks, bifurcations."""
 
 from typing import get_args
 
@@ -30,15 +30,15 @@ from snrmjax.simulate.continuation.event_equations import (
     EventEquations,
     EventKind,
 )
-from snrmjax.simulate.continuation.parameter_turns import with_turns
 from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 from snrmjax.simulate.continuation.stability import floquet_multipliers
+from snrmjax.simulate.continuation.turning_points import with_turning_points
 
 DEFAULT_STEPS = StepControl(max_points=2000)
-_SAME = 1e-10  # distance in scaled unknowns below which two points are one
+_SAME = 1e-10  # distance in scaled unknowns below which two points coincide
 _ROUNDING = 1e-12  # relative, of a parameter's value
-_SHOWN = 6  # turns that a summary lists
-_RESONANT = 1e-2  # second frequency, over the first, below which a curve that stops counts as ended
+_SHOWN = 6  # turning points that a summary lists
+_RESONANT = 1e-2  # ratio of second to first frequency below which a stopped curve has ended
 Start = tuple[Float[np.ndarray, "coefficient mode"], float]
 
 
@@ -55,12 +55,11 @@ class EventCurveEnd(Status):
 
 
 class EventCurve(MotionCurve):
-    """One kind of event of forced responses in order along a curve over a parameter.
+    """Curve of one kind of event of forced responses over a parameter.
 
-    `event` names the points at which the parameter turns back. A curve of folds does so in a
-    "cusp", where two folds meet and vanish; in an "isola_birth", where an isolated response
-    begins as a point; and in an "isola_merging", where it joins another response. Other curves
-    have a "turn".
+    `event` names the turning points of the parameter. On a curve of folds these are a "cusp", where
+    two folds meet and vanish; an "isola_birth", where an isolated response begins as a point; and
+    an "isola_merging", where it joins another response. On other curves they are a "turn".
     """
 
     kind: EventKind = setting()
@@ -69,10 +68,12 @@ class EventCurve(MotionCurve):
     value: Float[np.ndarray, " point"]  # of the parameter
     force: Float[np.ndarray, " point"] = quantity("point", "N", "force amplitude")
     event: tuple[str, ...] = quantity("point", "", "what happens there", static=True)
-    ends: tuple[EventCurveEnd, EventCurveEnd]  # where the curve ends, before and behind its points
-    # Of a Neimark-Sacker point, rad/s: of the second motion that begins there; else None.
+    ends: tuple[
+        EventCurveEnd, EventCurveEnd
+    ]  # where the curve ends, before its first and after its last point
+    # Of a Neimark-Sacker point, rad/s: second frequency of the bifurcating motion; else None.
     second_frequency: Float[np.ndarray, " point"] | None = None
-    n_not_located: int = setting(default=0)  # turns that are there but were not located
+    n_not_located: int = setting(default=0)  # turning points that were detected but not located
     n_solves: int = setting(default=0)  # linear systems factorised to trace the curve
 
     @property
@@ -81,11 +82,11 @@ class EventCurve(MotionCurve):
         return np.abs(self.velocity[:, 1, 0])
 
     def at_events(self, kind: str) -> np.ndarray:
-        """Indices of the points at which the parameter turns in this way."""
+        """Indices of the turning points of this kind."""
         return np.array([k for k, e in enumerate(self.event) if e == kind], dtype=int)
 
     def summary(self) -> tuple[str, ...]:
-        """Kind, parameter, ranges, turns and ends."""
+        """Kind, parameter, ranges, turning points and ends."""
         n, kind = len(self.frequency), self.kind.replace("_", " ")
         lines = [f"{kind} over {self.parameter}: {n} points"]
         if n:
@@ -102,7 +103,7 @@ class EventCurve(MotionCurve):
                 if name
             ][:_SHOWN]
         if self.n_not_located:
-            lines.append(f"turns not located: {self.n_not_located}")
+            lines.append(f"turning points not located: {self.n_not_located}")
         return (*lines, f"from {self.ends[0].message}", f"to {self.ends[1].message}")
 
     def variables(self) -> dict[str, Variable]:
@@ -117,23 +118,24 @@ class EventCurve(MotionCurve):
         return named
 
     def near(self, value: float) -> list[Start]:
-        """Where the curve passes a value of its parameter, between its points by lines.
+        """Points at which the curve crosses a value of its parameter, by linear interpolation.
 
-        Starts for `periodic_motion`, which solves for the motions themselves.
+        They are starts for `periodic_motion`, which solves for the motions.
         """
         off = self.value - value
         off = np.where(np.abs(off) <= _ROUNDING * abs(value), 0.0, off)
-        # At the points themselves, and between two on either side.
+        # At points of the curve, and between two points on either side.
         at = np.flatnonzero(off == 0)
         between = np.flatnonzero(off[1:] * off[:-1] < 0)
         x, omega = self.coefficients, self.frequency
-        found = [(int(k), x[k], float(omega[k])) for k in at]
+        crossings = [(int(k), x[k], float(omega[k])) for k in at]
         for k in between.tolist():
             fraction = off[k] / (off[k] - off[k + 1])
             motion = x[k] + fraction * (x[k + 1] - x[k])
-            found.append((k, motion, float(omega[k] + fraction * (omega[k + 1] - omega[k]))))
+            crossings.append((k, motion, float(omega[k] + fraction * (omega[k + 1] - omega[k]))))
         return [
-            (motion, frequency) for _, motion, frequency in sorted(found, key=lambda row: row[0])
+            (motion, frequency)
+            for _, motion, frequency in sorted(crossings, key=lambda row: row[0])
         ]
 
 
@@ -154,11 +156,11 @@ def follow_event(
     n_samples: int | None = None,
     steps: StepControl = DEFAULT_STEPS,
 ) -> EventCurve:
-    """Follow an event of a forced response as the force or a parameter of the model changes.
+    """Trace an event of a forced response as the force or a parameter of the model changes.
 
-    Solves the harmonic balance together with the event's condition, the parameter as a further
-    unknown, and traces the curve both ways from `start` through turns in the parameter and in the
-    frequency: from one end of the range to the other, or back to the same one, or around.
+    Solves the harmonic balance together with the event's condition, with the parameter as a further
+    unknown, and traces the curve in both directions from `start` through turning points of the
+    parameter and of the frequency: to the ends of the range, or around a closed curve.
     A "fold", "peak", "period_doubling" or "neimark_sacker" is where a bordered matrix is
     singular; the last two by Hill's method, with as many harmonics as the motion. Curves of a
     "phase_resonance" over the force are damped backbones, as `phase_controlled` traces them.
@@ -168,11 +170,11 @@ def follow_event(
     the range of the parameter, in N or in the unit of the model; `parameter` "force" or a name of
     `snrmjax.model.parameters.parameter_names`, an effect's among them.
     Returns an `EventCurve` in the direction in which the parameter rises at `start`; its `ends`
-    say where it ended on either side, its `status` how the worse of them did. A curve of
-    Neimark-Sacker points ends where its pair of multipliers meets at +1 or -1.
-    Raises `ValueError` for an unknown kind or parameter, for a range that does not hold the
-    parameter's value, for no pair of multipliers to follow, and for a Neimark-Sacker point with
-    friction, which Hill's method does not linearise.
+    are how it ended on either side, its `status` the worse of them. A curve of Neimark-Sacker
+    points ends where its pair of multipliers meets at +1 or -1.
+    Raises `ValueError` for an unknown kind or parameter, for a range that does not contain the
+    parameter's value, for a start without a pair of multipliers to follow, and for a
+    Neimark-Sacker point with friction, which Hill's method does not linearise.
     Not differentiable: call it outside, and differentiate single motions of its curve:
     `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
     far.
@@ -200,7 +202,7 @@ def follow_event(
     curve = _joined(*ways)
     closed = curve.status == CurveStatus.CLOSED
     sides = (ways[0], ways[0]) if closed else (ways[1], ways[0])
-    points, events, missed = with_turns(equations, curve, steps)
+    points, events, missed = with_turning_points(equations, curve, steps)
     balance = equations.balance
     value, second = points[:, -1] * scale, None
     if kind == "neimark_sacker":
@@ -230,7 +232,7 @@ def _problem(
     parameter: str,
     n_samples: int | None,
 ) -> tuple[EventEquations, Float[Array, " unknown"]]:
-    """The equations of an event and its first point. Raises as `follow_event` does."""
+    """The equations of an event and its starting point. Raises as `follow_event` does."""
     if kind not in get_args(EventKind):
         raise ValueError(f"`kind` must be one of {get_args(EventKind)}, but is {kind!r}.")
     (load,) = positive("force", force).tolist()
@@ -277,7 +279,7 @@ def _problem(
 
 
 def _second_frequency(model: Structure, coefficients: np.ndarray, frequency: float) -> float:
-    """Of the pair of multipliers nearest to the unit circle, rad/s."""
+    """Frequency (rad/s) of the pair of multipliers nearest to the unit circle."""
     row = floquet_multipliers(model, coefficients[None], np.array([frequency]))[0]
     pairs = row[row.imag > 1e-6 * np.abs(row)]
     if not pairs.size:
@@ -290,15 +292,15 @@ def _second_frequency(model: Structure, coefficients: np.ndarray, frequency: flo
 def trace_events(
     equations: EventEquations, start: Array, ends: Array, steps: StepControl, up: Array
 ) -> Curve:
-    """One way from a start, `up` 1 for a rising parameter and -1 for a falling one."""
+    """Trace from a start in one direction, `up` being 1 for a rising parameter and -1 else."""
     direction = jnp.zeros_like(start).at[-1].set(up)
     return trace_curve(equations.linearised, start, direction, CurveRange(ends[0], ends[1]), steps)
 
 
 def _before_resonance(way: TracedCurve) -> TracedCurve:
-    """The part on which the second frequency is below half the first, where the pair meets at −1.
+    """The part with the second frequency below half the first, where the pair meets at −1.
 
-    Beyond, the same motions come back with the complement as second frequency.
+    Beyond it the same motions recur with the complementary second frequency.
     """
     beyond = np.flatnonzero(np.sqrt(way.points[:, -2]) > 0.5 * way.points[:, -3])
     last = int(beyond[0]) if beyond.size else len(way.points)
@@ -306,7 +308,7 @@ def _before_resonance(way: TracedCurve) -> TracedCurve:
 
 
 def _end_of(way: TracedCurve, kind: EventKind) -> EventCurveEnd:
-    """Where one way from the start ended."""
+    """How the curve ended in one direction from the start."""
     if kind == "neimark_sacker" and len(way.points) > 1:
         before, last = np.sqrt(way.points[-2:, -2]) / way.points[-2:, -3]
         near_half = last + abs(last - before) > 0.5
@@ -317,13 +319,13 @@ def _end_of(way: TracedCurve, kind: EventKind) -> EventCurveEnd:
 
 
 def _joined(up: TracedCurve, down: TracedCurve) -> TracedCurve:
-    """Both ways from the start as one curve, the parameter rising at the start."""
+    """Both directions joined to one curve, with the parameter rising at the start."""
     if up.status == CurveStatus.CLOSED or not len(down.points):
         return up
     solves = up.n_solves + down.n_solves
     points = np.concatenate([down.points[::-1], up.points[1:]])
     tangents = np.concatenate([-down.tangents[::-1], up.tangents[1:]])
-    # A start on the end of the range is found again as that end.
+    # A start at an end of the range would be repeated as that end.
     fresh = np.linalg.norm(np.diff(points, axis=0), axis=1) > _SAME
     keep = np.concatenate([[True], fresh])
     ends = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)

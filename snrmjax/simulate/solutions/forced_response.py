@@ -1,4 +1,4 @@
-"""Forced responses by harmonic balance: whole curves, folds and resonances included."""
+"""Forced responses by harmonic balance: whole curves with folds and resonances."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -29,12 +29,12 @@ from snrmjax.simulate.continuation.response_curve import (
 from snrmjax.simulate.solutions.from_rest import curves_from_rest, curves_where_sweeps_land
 
 DEFAULT_STEPS = StepControl()
-_AT_FOLD = 1e-3  # of the frequency: the last stable point before a fold is as near
+_AT_FOLD = 1e-3  # relative distance in frequency of a fold and the last stable point
 _WHOLE = (CurveStatus.UPPER_END, CurveStatus.LOWER_END, CurveStatus.CLOSED)
 
 
 class ResponseSettings(eqx.Module):
-    """How forced responses are computed: as `forced_response` has them one by one."""
+    """Settings of forced responses, as the keywords of `forced_response`."""
 
     harmonic_order: int = eqx.field(static=True, default=9)
     n_samples: int | None = eqx.field(static=True, default=None)  # over a period; None: as needed
@@ -62,27 +62,26 @@ def forced_response(
     steps: StepControl = DEFAULT_STEPS,
     stability: bool = True,
 ) -> list[ResponseCurve]:
-    """Trace the response to a cosine force through a frequency range, once for every force.
+    """Trace the response to a cosine force through a frequency range, for one or more forces.
 
-    Solves m q̈ + d q̇ + k q + ∂V/∂q + Σ effects = Φᵀb F Σ s_h cos hΩt by harmonic balance. Starts
-    from the linear response at `from_frequency`, or where that leads nowhere from the
-    response to a force that rises from zero, and traces the curve around its folds by
-    pseudo-arclength continuation until it leaves the range. Located between the steps and
-    inserted with a name in `event` are folds ("fold"), peaks of the velocity fundamental at the
-    first sensor ("peak"), phase resonances of the mode of interest ("phase_resonance") and, with
-    `stability`, bifurcations ("branch_point", "period_doubling", "neimark_sacker").
+    Solves m q̈ + d q̇ + k q + ∂V/∂q + Σ f_nl = Φᵀb F Σ s_h cos hΩt by harmonic balance. Starts from
+    the linear response at `from_frequency`, or if that fails from the response to a force raised
+    from zero, and traces the curve around its folds by pseudo-arclength continuation until it
+    leaves the range. Events are located between the steps and inserted with a name in `event`:
+    folds ("fold"), peaks of the velocity fundamental at the first sensor ("peak"), phase
+    resonances of the mode of interest ("phase_resonance") and, with `stability`, bifurcations
+    ("branch_point", "period_doubling", "neimark_sacker").
 
     Arguments: `forces` in N, one or many; frequencies in rad/s; `n_samples` over a period, by
     default as many as the forces of the model need.
-    Returns one `ResponseCurve` for every force; its `status` says how it ended, and
-    `not_located` names events that are there but were not located, and with "branch" one that
-    comes in at `to_frequency` but has no start there. When the curve
-    from the lower end does not reach the upper one, it is traced from the upper end instead,
-    and when that does not reach the lower end either, both parts are returned, a part without a
-    start being empty. Where a resonance reaches beyond `to_frequency`, the branch that comes in
-    there from the linear response is returned too. Isolated branches and second wells:
-    `isolated_responses`.
-    Raises `ValueError` for a force that is not positive and for an empty or endless frequency
+    Returns one `ResponseCurve` for every force; its `status` is how it ended, and `not_located`
+    names events that were detected but not located, and "branch" if one enters at `to_frequency`
+    but has no start there. If the curve from the lower end does not reach the upper one, it is
+    traced from the upper end instead, and if that does not reach the lower end either, both parts
+    are returned, a part without a start being empty. If a resonance extends beyond
+    `to_frequency`, the branch that enters there from the linear response is returned too. For
+    isolated branches and further potential wells see `isolated_responses`.
+    Raises `ValueError` for a force that is not positive and for an empty or infinite frequency
     range.
     Not differentiable: call it outside, and differentiate single motions of its curve:
     `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
@@ -97,12 +96,12 @@ def forced_response(
     ends = frequency_range(from_frequency, to_frequency)
     models = [simulated_structure(model)] * len(loads)
     settings = ResponseSettings(harmonic_order, n_samples, steps, stability)
-    found = _chunk_of_curves(models, loads, ends, settings, alone=len(loads) == 1)
-    return [part for parts in found for part in parts]
+    curves = _chunk_of_curves(models, loads, ends, settings, alone=len(loads) == 1)
+    return [part for parts in curves for part in parts]
 
 
 class ResponseBatch(AbstractResult):
-    """Forced responses of many members; NaN where a member has no such point, or stopped early."""
+    """Forced responses of many members; NaN if a member has no such point or stopped early."""
 
     curves: tuple[tuple[ResponseCurve, ...], ...]  # empty without `keep_curves`
     status: Int[np.ndarray, " member"] = quantity(
@@ -141,31 +140,31 @@ def forced_response_batch(
 ) -> ResponseBatch:
     """Forced responses of many models, forces or both, over all cores or on an accelerator.
 
-    Every member is what `forced_response` gives, to rounding; its digits do not depend on the other
-    members. Several members are traced side by side, on every core. Other numbers, or more
-    members, do not compile anew. Memory is bounded by `chunk`, the members at
-    work at a time, beside the curves that are kept.
+    Every member equals the result of `forced_response` to rounding and does not depend on the other
+    members. Several members are traced in parallel, on every core. Other values, or more members,
+    do not recompile. Memory is bounded by `chunk`, the number of members traced at a time, in
+    addition to the curves that are kept.
 
     Arguments: `models` one or many, with the same modes, monomials and effects; `forces` in N,
-    one or many; frequencies in rad/s. `progress` is called with the members done and all of them.
-    Returns a `ResponseBatch`. A member that fails has its status, and NaN in its values; the
-    others are untouched. Raises `ValueError` when the numbers of models and forces disagree, for
-    models of different kinds and for an empty or endless frequency range.
+    one or many; frequencies in rad/s; `progress` is called with the members done and their total.
+    Returns a `ResponseBatch`. A member that fails has its status, and NaN values; the others are
+    not affected. Raises `ValueError` when the numbers of models and forces disagree, for models of
+    different kinds and for an empty or infinite frequency range.
     Not differentiable: call it outside, and differentiate single motions of its curve:
     `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
     far.
     """
     ends = frequency_range(from_frequency, to_frequency)
     members, loads = _paired(models, forces)
-    # Which rows of one object are many times the same model is known before it is expanded.
+    # Repeated models are one object: each is expanded only once.
     expanded = {id(m): simulated_structure(m) for m in members}
     rows: list[tuple[ResponseCurve, ...]] = []
     summaries = []
     for begin in range(0, len(members), chunk):
         some = [expanded[id(m)] for m in members[begin : begin + chunk]]
-        found = _chunk_of_curves(some, loads[begin : begin + chunk], ends, settings)
-        summaries += [_summary(parts) for parts in found]
-        rows += found if keep_curves else []
+        chunk_curves = _chunk_of_curves(some, loads[begin : begin + chunk], ends, settings)
+        summaries += [_summary(parts) for parts in chunk_curves]
+        rows += chunk_curves if keep_curves else []
         if progress is not None:
             progress(min(begin + chunk, len(members)), len(members))
     names = [field.name for field in dataclasses.fields(ResponseBatch)][1:]
@@ -191,7 +190,7 @@ def _paired(
 
 
 def _summary(parts: tuple[ResponseCurve, ...]) -> dict[str, float]:
-    """The numbers of one member, named as in `ResponseBatch`: none where a curve stopped early."""
+    """The numbers of one member, as in `ResponseBatch`; NaN if a curve stopped early."""
     stopped = [part.status for part in parts if part.status not in _WHOLE]
     best = {"peak": (np.nan, np.nan), "phase_resonance": (np.nan, np.nan)}
     whole = () if stopped else parts
@@ -205,7 +204,7 @@ def _summary(parts: tuple[ResponseCurve, ...]) -> dict[str, float]:
     if has_higher_point(whole, best["peak"][1]):
         best["peak"], n_not_located = (np.nan, np.nan), n_not_located + 1
     return {
-        # A second branch that stopped early is the member's failure too.
+        # A second branch that stopped early also makes the member fail.
         "status": int(stopped[0] if stopped else parts[0].status),
         "n_points": sum(len(part.frequency) for part in parts),
         "peak_frequency": best["peak"][0],
@@ -218,9 +217,9 @@ def _summary(parts: tuple[ResponseCurve, ...]) -> dict[str, float]:
 
 
 def has_higher_point(parts: Sequence[ResponseCurve], peak: float) -> bool:
-    """Whether curves are highest between their ends, and higher than the highest `peak` of them.
+    """Whether the largest point of a curve is inside its range and higher than any located peak.
 
-    That is the velocity (m/s), NaN where there is none. A peak is there then that was not located.
+    Then a peak was not located. Arguments: `peak` is the highest located velocity (m/s), or NaN.
     """
     for part in parts:
         speed = np.abs(part.velocity[:, 1, 0])
@@ -253,16 +252,16 @@ def _chunk_of_curves(
         some, forces[good], settings.harmonic_order, settings.n_samples, ends
     )
     lanes = 1 if alone else lanes_for(balances.size + 1)
-    found = curves_from_rest(some, balances, ends, settings.steps, lanes)
-    owner = [k for k, one in enumerate(found) for _ in one.curves]
-    parts = [curve for one in found for curve in one.curves]
-    branches = [branch for one in found for branch in one.branches]
+    from_rest = curves_from_rest(some, balances, ends, settings.steps, lanes)
+    owner = [k for k, one in enumerate(from_rest) for _ in one.curves]
+    parts = [curve for one in from_rest for curve in one.curves]
+    branches = [branch for one in from_rest for branch in one.branches]
     responses = assembled(
         taken(balances, np.array(owner)), parts, settings.steps, stability=settings.stability
     )
     for k, branch, response in zip(owner, branches, responses, strict=True):
         results[good[k]].append(dataclasses.replace(response, branch=branch))
-    for i, (k, one) in enumerate(zip(good, found, strict=True)):
+    for i, (k, one) in enumerate(zip(good, from_rest, strict=True)):
         folds = _left_folds(results[k], ends)
         if folds:
             new = curves_where_sweeps_land(*(balances, i, one.curves, folds, ends, settings.steps))
@@ -279,7 +278,7 @@ def _chunk_of_curves(
 def _left_folds(
     curves: Sequence[ResponseCurve], ends: Float[np.ndarray, " end"]
 ) -> list[tuple[float, float]]:
-    """Folds beyond which no curve has a stable point, and how far that goes (rad/s)."""
+    """Folds next to a range without stable points, and the other end of that range (rad/s)."""
     at = np.concatenate([curve.frequency[curve.at_events("fold")] for curve in curves])
     return [
         (edge, other)
@@ -313,13 +312,13 @@ def solve_at_frequency(
     *,
     n_samples: int | None = None,
 ) -> tuple[Float[Array, "state coefficient mode"], Bool[Array, " state"]]:
-    """Periodic motions at given forces (N) and frequencies (rad/s), each from its own guess.
+    """Solve for periodic motions at given forces (N) and frequencies (rad/s), from guesses.
 
     Arguments: `force` and `frequency` of each state, or one of all states; `start` the Fourier
     coefficients of the guesses in kg^1/2 m.
-    Returns the Fourier coefficients (kg^1/2 m), NaN where Newton's method did not converge, and
-    whether it did. For `jax.jit` and `jax.vmap`; differentiable forward (`jax.jvp`), not by
-    `jax.grad`: that goes through `periodic_motion`.
+    Returns the Fourier coefficients (kg^1/2 m), NaN if Newton's method did not converge, and
+    whether it did. For `jax.jit` and `jax.vmap`; differentiable in forward mode (`jax.jvp`) only:
+    for `jax.grad` use `periodic_motion`.
     """
     guesses = jnp.asarray(start, dtype=jnp.float64)
     loads, speeds = (
@@ -339,7 +338,7 @@ def _solve_batch(
     harmonic_order = (start.shape[1] - 1) // 2
 
     def solved(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
-        # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
+        # With the static displacement the unknowns are of order one for a guess of zero too.
         static = newtons(model.modes.unbalance, frequency, force) * model.modes.participation
         squared = model.modes.natural_frequency**2
         static = jnp.where(squared > 0, static / jnp.where(squared > 0, squared, 1.0), 0.0)
@@ -349,7 +348,7 @@ def _solve_batch(
         )
         guess = balance.point(start, frequency)
         fixed = jnp.zeros_like(guess).at[-1].set(1.0)
-        found = correct(balance.linearised, guess, fixed, 1e-10, 30)
-        return balance.coefficients(found.point), found.converged
+        end = correct(balance.linearised, guess, fixed, 1e-10, 30)
+        return balance.coefficients(end.point), end.converged
 
     return mapped(solved, force, frequency, start)

@@ -1,7 +1,7 @@
-"""The curves that a response to one force is made of: what slow sweeps through a range would show.
+"""The branches of a response to one force that slow sweeps through a range would visit.
 
-A sweep begins in one of the structure's stable equilibria, at an end of the range or beyond a
-resonance outside it. Two of these motions may lie on one curve.
+A sweep starts from one of the structure's stable equilibria, at an end of the range or beyond a
+resonance outside it. Two of these motions may lie on the same curve.
 """
 
 from collections.abc import Sequence
@@ -26,22 +26,22 @@ from snrmjax.simulate.continuation.curve_tracing import (
 )
 from snrmjax.simulate.continuation.response_curve import Branch
 
-_N_STARTS = 24  # of the search for further equilibria: each response of a study pays for it
-_MARGIN = 0.5  # of what rules a further equilibrium out in a direction
-_NEAR_LINEAR = 0.5  # of the linear response: the motion that differs by less is the one from rest
-# A resonance outside the range is passed where its hysteresis may reach into it: a mode of which
-# little is left softens by a third; hardening has no such limit.
+_N_STARTS = 24  # of the search for further equilibria; few, as every response pays for it
+_MARGIN = 0.5  # factor on the criterion that excludes further equilibria in a direction
+_NEAR_LINEAR = 0.5  # relative difference from the linear response of a motion from rest
+# Resonances outside the range are included where their hysteresis may extend into it: a softening
+# mode seldom loses more than a third of its frequency; hardening has no such limit.
 _REACH_OF_MODE_ABOVE, _REACH_OF_MODE_BELOW = 1.5, 2.5  # ratios of frequencies
-_INSIDE = 0.02  # of a gap between stable responses: how far in a further one is looked for
-_SAME = 1e-5  # distance of scaled points that are one
+_INSIDE = 0.02  # depth into a gap between stable responses at which others are sought, relative
+_SAME = 1e-5  # distance below which scaled points coincide
 
 
 class CurvesFromRest(NamedTuple):
-    """The curves of one member, each once; first one through the whole range, where there is."""
+    """The distinct curves of one member, first one through the whole range if there is one."""
 
     curves: list[TracedCurve]
     branches: list[Branch]
-    has_no_start: bool  # a branch comes in at the upper end whose start was not found
+    has_no_start: bool  # a branch enters at the upper end without a start
 
 
 def curves_from_rest(
@@ -53,25 +53,27 @@ def curves_from_rest(
 ) -> list[CurvesFromRest]:
     """The curves of every member through a range (rad/s).
 
-    A curve is traced from the linear response, and where that is not near or leads nowhere, from
-    the motion under a force that rises from zero. From the upper end it is traced where the
-    curve from the lower end does not end near the linear response there. Further curves come from
-    further stable equilibria, and from beyond resonances of modes outside the range.
+    A curve is traced from the linear response, and if that is not near or fails, from the motion
+    under a force raised from zero. It is also traced from the upper end if the curve from the
+    lower end does not end near the linear response there. Further curves start from further stable
+    equilibria, and from beyond resonances outside the range.
     """
-    walk = (balances, ends, steps, lanes)
-    upward = _from_end(*walk, np.arange(len(models)), downward=False)
-    doubtful = [k for k, curve in enumerate(upward) if not _ends_near_rest(balances, k, curve)]
+    settings = (balances, ends, steps, lanes)
+    upward = _from_end(*settings, np.arange(len(models)), downward=False)
+    unmatched = [k for k, curve in enumerate(upward) if not _ends_near_rest(balances, k, curve)]
     backward = dict.fromkeys(range(len(models)))
-    backward |= zip(doubtful, _from_end(*walk, np.array(doubtful, int), downward=True), strict=True)
-    found = []
+    backward |= zip(
+        unmatched, _from_end(*settings, np.array(unmatched, int), downward=True), strict=True
+    )
+    members = []
     for curve, back in zip(upward, backward.values(), strict=True):
         parts = [curve] if back is None else _joined(curve, back)
         lost = back is not None and not len(back.points) and _is_whole(curve)
-        found.append(CurvesFromRest(parts, [Branch.MAIN] * len(parts), lost))
-    _add_other_rests(models, found, *walk)
+        members.append(CurvesFromRest(parts, [Branch.MAIN] * len(parts), lost))
+    _add_other_equilibria(models, members, *settings)
     for downward in (False, True):
-        _add_from_beyond(found, *walk, downward=downward)
-    return [_without_empty(one) for one in found]
+        _add_from_beyond(members, *settings, downward=downward)
+    return [_without_empty(one) for one in members]
 
 
 def curves_where_sweeps_land(
@@ -82,11 +84,11 @@ def curves_where_sweeps_land(
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
 ) -> list[TracedCurve]:
-    """Further curves of one member where a sweep leaves a fold for none of the known ones.
+    """Further curves of one member on which a sweep lands beyond a fold of the known ones.
 
-    They need not reach an end of the range. Arguments: `folds` are frequencies (rad/s) of folds
-    and of the other end of the part without a stable response. Motions are looked for just beyond
-    the fold, over a force that rises past its value.
+    They need not reach an end of the range. Arguments: `folds` are frequencies (rad/s) of folds and
+    of the other end of the range without stable response. Motions are sought just beyond the fold,
+    over a force raised past its value.
     """
     curves: list[TracedCurve] = []
     own = taken(balances, np.array([member]))
@@ -94,11 +96,11 @@ def curves_where_sweeps_land(
         for point in at_force(own, 0, fold + _INSIDE * (beyond - fold), steps, 1):
             if any(lies_on(point, one.points) for one in (*known, *curves)):
                 continue
-            found = trace_both_ways(own, point, ends, steps)
-            # The point lies between two of a curve: what is traced from it may be known.
-            middle = found.points[len(found.points) // 2 :][:1]
+            curve = trace_both_ways(own, point, ends, steps)
+            # The point was interpolated: the curve traced from it may be a known one.
+            middle = curve.points[len(curve.points) // 2 :][:1]
             if len(middle) and not any(lies_on(middle[0], one.points) for one in (*known, *curves)):
-                curves.append(found)
+                curves.append(curve)
     return curves
 
 
@@ -111,17 +113,17 @@ def _from_end(
     *,
     downward: bool,
 ) -> list[TracedCurve]:
-    """From an end: the linear response there, or what the motion from rest is instead."""
-    walk = (ends, steps, lanes)
-    curves = trace_from_rest(balances, index, *walk, downward=downward)
-    # Where the linear response is large, Newton's method goes from it to another solution.
+    """Curves from an end: from the linear response there, or from the motion from rest."""
+    settings = (ends, steps, lanes)
+    curves = trace_from_rest(balances, index, *settings, downward=downward)
+    # From a large linear response Newton's method may converge to another solution.
     far = [
         i
         for i, k in enumerate(index)
         if not len(curves[i].points) or not _is_near_rest(balances, k, curves[i].points[0])
     ]
     end = float(ends[int(downward)])
-    # Newton's method from rest and from the linear response: where both agree there is one motion.
+    # If Newton's method from rest and from the linear response agree, the motion is unique.
     small = motions_at(balances, index[far], end, steps, lanes)
     far = [i for i, start in zip(far, small, strict=True) if not _passes(curves[i], start)]
     starts = under_rising_force(balances, index[far], end, steps, lanes)
@@ -131,7 +133,7 @@ def _from_end(
         if np.isfinite(starts[j]).all() and not _passes(curves[i], starts[j])
     ]
     again = trace_from_rest(
-        *(balances, index[far][new], *walk), downward=downward, starts=starts[new]
+        *(balances, index[far][new], *settings), downward=downward, starts=starts[new]
     )
     for j, curve in zip(new, again, strict=True):
         if len(curve.points):
@@ -154,52 +156,52 @@ def _joined(curve: TracedCurve, back: TracedCurve) -> list[TracedCurve]:
     return [curve, back if _is_whole(curve) else back.reversed()]
 
 
-def _without_empty(found: CurvesFromRest) -> CurvesFromRest:
-    """The same without a curve that has no start, where another begins or ends at the lower end.
+def _without_empty(member: CurvesFromRest) -> CurvesFromRest:
+    """Without curves that have no start, if another begins or ends at the lower end.
 
-    A motion that leaves its rest under the rising force settles on one of the others.
+    A motion that leaves its equilibrium under the rising force settles on one of the others.
     """
     at_lower_end = [
         one.status == CurveStatus.LOWER_END or branch is not Branch.MAIN
-        for one, branch in zip(found.curves, found.branches, strict=True)
+        for one, branch in zip(member.curves, member.branches, strict=True)
     ]
     if not any(at_lower_end):
-        return found
-    kept = [k for k, one in enumerate(found.curves) if len(one.points)]
-    return found._replace(
-        curves=[found.curves[k] for k in kept], branches=[found.branches[k] for k in kept]
+        return member
+    kept = [k for k, one in enumerate(member.curves) if len(one.points)]
+    return member._replace(
+        curves=[member.curves[k] for k in kept], branches=[member.branches[k] for k in kept]
     )
 
 
-def _add_other_rests(
+def _add_other_equilibria(
     models: Sequence[Structure],
-    found: list[CurvesFromRest],
+    members: list[CurvesFromRest],
     balances: HarmonicBalance,
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
     lanes: int,
 ) -> None:
-    """Curves from further stable equilibria, from both ends, that are not among those found."""
+    """Add new curves from further stable equilibria, from both ends."""
     owners, rests = [], []
-    for k in np.flatnonzero(_may_rest_elsewhere(models)).tolist():
+    for k in np.flatnonzero(_may_have_other_equilibria(models)).tolist():
         for other in equilibria(models[k], n_starts=_N_STARTS):
             if other.stable and np.any(other.displacement):
                 owners.append(k)
                 rests.append(other.displacement)
     if not owners:
         return
-    index, rest, walk = np.array(owners), np.array(rests), (balances, ends, steps, lanes)
+    index, rest, settings = np.array(owners), np.array(rests), (balances, ends, steps, lanes)
     for downward in (False, True):
         end = float(ends[int(downward)])
         starts = under_rising_force(balances, index, end, steps, lanes, rest=rest)
-        _add(found, owners, starts, Branch.EQUILIBRIUM, *walk, downward=downward)
+        _add(members, owners, starts, Branch.EQUILIBRIUM, *settings, downward=downward)
 
 
-def _may_rest_elsewhere(models: Sequence[Structure]) -> Bool[np.ndarray, " member"]:
-    """Whether members may have further equilibria: quick, where forces are polynomials.
+def _may_have_other_equilibria(models: Sequence[Structure]) -> Bool[np.ndarray, " member"]:
+    """Whether members may have further equilibria: a quick test for polynomial forces.
 
-    On the line s d through an equilibrium ½ω²s² + V₃(d)s³ + V₄(d)s⁴ is stationary there, which
-    asks for 9 V₃² ≥ 16 ω² V₄. That is looked at in many directions d, and with a margin.
+    On the line s d through an equilibrium the potential ½ω²s² + V₃(d)s³ + V₄(d)s⁴ is stationary
+    there, which requires 9 V₃² ≥ 16 ω² V₄. Tested in many directions d, with a margin.
     """
     potential = models[0].potential
     degrees = [len(monomial) for monomial in potential.monomials]
@@ -227,7 +229,7 @@ def _may_rest_elsewhere(models: Sequence[Structure]) -> Bool[np.ndarray, " membe
 
 
 def _add_from_beyond(
-    found: list[CurvesFromRest],
+    members: list[CurvesFromRest],
     balances: HarmonicBalance,
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
@@ -235,7 +237,7 @@ def _add_from_beyond(
     *,
     downward: bool,
 ) -> None:
-    """Curves that enter at the lower (upper) end from below (above) a resonance outside."""
+    """Add curves that enter the range from beyond a resonance outside it."""
     end = float(ends[int(downward)])
     natural = np.asarray(balances.model.modes.natural_frequency)  # of every member
     # A mass without a linear spring has no natural frequency.
@@ -247,7 +249,7 @@ def _add_from_beyond(
     owners = np.flatnonzero(near.any(axis=1)).tolist()
     if not owners:
         return
-    # One frequency for all: far beyond the resonances that may reach in, and short of the next.
+    # One start for all: well beyond the resonances that may extend in, and short of the next.
     farthest = float(np.max(ratio[near]))
     others = ratio[owners][(ratio[owners] > farthest)]
     away = farthest * np.sqrt(min(np.min(others, initial=2 * farthest) / farthest, 2.0))
@@ -259,12 +261,12 @@ def _add_from_beyond(
     for start, curve in zip(starts, outside, strict=True):
         if curve.status == (CurveStatus.LOWER_END if downward else CurveStatus.UPPER_END):
             start[:] = curve.points[-1]
-    walk = (balances, ends, steps, lanes)
-    _add(found, owners, starts, Branch.BEYOND, *walk, downward=downward)
+    settings = (balances, ends, steps, lanes)
+    _add(members, owners, starts, Branch.BEYOND, *settings, downward=downward)
 
 
 def _add(
-    found: list[CurvesFromRest],
+    members: list[CurvesFromRest],
     owners: Sequence[int],
     starts: Float[np.ndarray, "start unknown"],
     branch: Branch,
@@ -275,11 +277,11 @@ def _add(
     *,
     downward: bool,
 ) -> None:
-    """Curves through starts at an end that lie on no curve of their owners."""
+    """Add curves through starts at an end that lie on no known curve of their member."""
 
     def is_new(owner: int, start: np.ndarray) -> bool:
         finite = bool(np.isfinite(start).all())
-        return finite and not any(_passes(one, start) for one in found[owner].curves)
+        return finite and not any(_passes(one, start) for one in members[owner].curves)
 
     new = [i for i, k in enumerate(owners) if is_new(k, starts[i])]
     index = np.array(owners, dtype=int)[new]
@@ -288,8 +290,8 @@ def _add(
     )
     for k, curve in zip(index.tolist(), curves, strict=True):
         if len(curve.points) and is_new(k, curve.points[0]):
-            found[k].curves.append(curve.reversed() if downward else curve)
-            found[k].branches.append(branch)
+            members[k].curves.append(curve.reversed() if downward else curve)
+            members[k].branches.append(branch)
 
 
 def _is_whole(curve: TracedCurve) -> bool:
@@ -304,14 +306,14 @@ def _passes(curve: TracedCurve, point: Float[np.ndarray, " unknown"]) -> bool:
 
 
 def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) -> bool:
-    """Whether a curve goes through the range to about the linear response: then it is alone."""
+    """Whether a curve crosses the whole range and ends near the linear response."""
     return _is_whole(curve) and _is_near_rest(balances, member, curve.points[-1])
 
 
 def _is_near_rest(
     balances: HarmonicBalance, member: int, point: Float[np.ndarray, " unknown"]
 ) -> bool:
-    """Whether a point is about the linear response there."""
+    """Whether a point is near the linear response."""
     modes, j = balances.model.modes, balances.model.modes.mode_of_interest
     drive = np.asarray(modes.participation)[member]
     own = np.abs(drive[j]) > STILL * np.max(np.abs(drive))

@@ -1,4 +1,4 @@
-"""Responses that no curve from rest reaches: isolated loops and motions in other wells."""
+"""Responses not connected to the one from rest: isolated loops, motions in other wells."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -35,7 +35,7 @@ Start = tuple[Float[np.ndarray, "coefficient mode"], float]
 
 
 class IsolatedSearch(eqx.Module):
-    """Where `isolated_responses` starts from, beside phase resonances and equilibria."""
+    """Starts of `isolated_responses` in addition to phase resonances and equilibria."""
 
     starts: Sequence[Start] = ()  # (coefficients in kg^1/2 m, frequency in rad/s)
     n_starts: int = 128  # random amplitudes and phases of the mode of interest
@@ -46,20 +46,18 @@ DEFAULT_SEARCH = IsolatedSearch()
 
 
 class IsolatedResponses(AbstractResult):
-    """Response curves apart from the one from rest, and what became of every start.
+    """Response curves apart from the one from rest, and the outcome of the starts.
 
-    A sequence of the curves: it has a length, and indices and loops give its curves.
+    A sequence of the curves: it has a length, can be indexed and iterated.
     """
 
     curves: tuple[ResponseCurve, ...]
     force: float = setting()  # N
     n_starts: int = setting()
     n_failed: int = setting()  # starts from which Newton's method did not converge
-    n_known: int = setting()  # motions out of the range, or on a curve that is known already
-    n_not_traced: int = (
-        setting()
-    )  # motions apart from known curves that no curve was traced through
-    # Of the force-appropriated backbone; UPPER_END when it is whole.
+    n_known: int = setting()  # motions outside the range, or on a known curve
+    n_not_traced: int = setting()  # motions off known curves through which no curve could be traced
+    # Of the force-appropriated backbone; UPPER_END when it is complete.
     backbone_status: CurveStatus = setting()
 
     def __len__(self) -> int:
@@ -72,7 +70,7 @@ class IsolatedResponses(AbstractResult):
         return self.curves[k]
 
     def variables(self) -> dict[str, Variable]:
-        """One row a curve: how it was found, its range and status."""
+        """One entry per curve: how it was found, its range and status."""
         rows = [
             (
                 *(c.branch, c.status.name.lower(), len(c.frequency)),
@@ -113,18 +111,17 @@ def isolated_responses(
 ) -> IsolatedResponses:
     """Search for response curves that are not connected to the one from rest, and trace them.
 
-    Newton's method starts from the motions given, from every phase resonance that the force-
-    appropriated backbone has at this force (traced to twice the force: the tips of loops are among
+    Newton's method starts from the given motions, from every phase resonance of the force-
+    appropriated backbone at this force (traced to twice the force; the tips of loops are among
     them), from vibrations about every stable equilibrium, and from random amplitudes and phases of
     the mode of interest across the frequency range. Through each motion that lies on no known
-    curve a curve is traced both ways, around if it is closed.
+    curve a curve is traced in both directions, or around if it is closed.
 
-    Arguments: `force` in N, frequencies in rad/s; `known` curves of this force, those of
-    `forced_response` if not given; `search` says where to start; `settings` as in
-    `forced_response_batch`.
-    Returns `IsolatedResponses`: one `ResponseCurve` for every further curve, whose `branch` says
-    how it was found and whose `status` is CLOSED for an isolated loop, and how many starts failed.
-    A search, not a proof: none found is none found by `n_starts` starts.
+    Arguments: `force` in N, frequencies in rad/s; `known` curves of this force, by default those of
+    `forced_response`; `search` defines the starts; `settings` as in `forced_response_batch`.
+    Returns `IsolatedResponses`: one `ResponseCurve` for every further curve, whose `branch` is how
+    it was found and whose `status` is CLOSED for an isolated loop, and how many starts failed.
+    The search is not a proof: further curves may exist that `n_starts` starts do not reach.
     Raises `ValueError` for a force that is not positive, an empty frequency range and starts of
     other harmonics than `harmonic_order`.
     Not differentiable: call it outside, and differentiate single motions of its curve:
@@ -145,7 +142,7 @@ def isolated_responses(
     named = _starts(balance, ends, search, resonances)
     solved = _solutions(balance, named, ends)
     curves = [_scaled(balance, curve) for curve in known if len(curve.frequency) > 1]
-    found: list[ResponseCurve] = []
+    isolated: list[ResponseCurve] = []
     n_known, n_not_traced = solved.n_outside, 0
     for point, origin in zip(solved.points, solved.origins, strict=True):
         if any(lies_on(point, curve) for curve in curves):
@@ -157,9 +154,11 @@ def isolated_responses(
             continue
         curves.append(traced.points)
         stability = settings.stability
-        found += assembled(balances, [traced], settings.steps, stability=stability, branch=origin)
+        isolated += assembled(
+            balances, [traced], settings.steps, stability=stability, branch=origin
+        )
     return IsolatedResponses(
-        curves=tuple(found),
+        curves=tuple(isolated),
         force=load,
         n_starts=len(named),
         n_failed=solved.n_failed,
@@ -200,7 +199,7 @@ def _starts(
     for k in range(search.n_starts):
         frequency = rng.uniform(ends[0], ends[1])
         amplitude = scale * 10 ** rng.uniform(-1.5, 0.5)
-        # Isolated loops surround the backbone: half of the starts are in phase resonance.
+        # Isolated loops surround the backbone: half of the starts have the phase of resonance.
         angle = 0.5 * np.pi if k % 2 else rng.uniform(0, 2 * np.pi)
         x = np.zeros((n, model.n_modes))
         x[0] = wells[k % len(wells)].displacement if wells else 0.0
@@ -210,7 +209,7 @@ def _starts(
 
 
 def _phase_resonances(balance: HarmonicBalance) -> tuple[list[Start], CurveStatus]:
-    """Where the force-appropriated backbone passes this force, and how the backbone ended."""
+    """Points of the force-appropriated backbone at this force, and the status of the backbone."""
     if not balance.model.modes.driven()[balance.model.modes.mode_of_interest]:
         return [], CurveStatus.NO_START
     force = float(balance.force)
@@ -230,7 +229,7 @@ def _phase_resonances(balance: HarmonicBalance) -> tuple[list[Start], CurveStatu
 
 
 class _Solutions(NamedTuple):
-    """Motions that Newton's method reached inside the range, and how many it did not."""
+    """Converged motions inside the range, and the numbers of the others."""
 
     points: list[np.ndarray]  # scaled
     origins: list[Branch]
@@ -246,13 +245,13 @@ def _solutions(
     starts = padded(np.stack([row[0] for row in named]))
     frequency = padded(np.array([row[1] for row in named]))
     force = np.full(len(frequency), float(balance.force))
-    found, ok = solve_at_frequency(
+    solutions, ok = solve_at_frequency(
         balance.model, force, frequency, starts, n_samples=balance.n_samples
     )
     inside = ((frequency >= ends[0]) & (frequency <= ends[1]))[:count]
     converged = np.asarray(ok)[:count]
     good = np.flatnonzero(converged & inside)
-    x = np.asarray(found)[good].reshape(len(good), -1) / float(balance.displacement_scale)
+    x = np.asarray(solutions)[good].reshape(len(good), -1) / float(balance.displacement_scale)
     omega = frequency[good] / float(balance.frequency_scale)
     points = np.concatenate([x, omega[:, None]], axis=1)
     return _Solutions(

@@ -17,9 +17,9 @@ from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
 from snrmjax.simulate.balance.not_found import nan_unless
 from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion, root_of
 
-_ITERATIONS = 12  # of Newton's method, which starts from a prediction
-_LATE = 0.5  # correction over step beyond which the step may have gone to another motion
-_TURN = 0.2  # of the frequency, likewise
+_ITERATIONS = 12  # of Newton's method, started from a prediction
+_LATE = 0.5  # largest correction over step: beyond it another motion may have been reached
+_LARGEST_SHIFT = 0.2  # largest relative change of the frequency in a step, likewise
 
 
 @on_one_core
@@ -33,18 +33,18 @@ def normal_mode_at_velocities(
     """The nonlinear normal mode of interest at given velocity amplitudes, differentiable.
 
     Solves m q̈ + k q + ∂V/∂q = 0 (damping, friction, and forces that depend on velocity, left out)
-    with |V₁| = the velocity at the first sensor: the backbone, natural frequency against
-    amplitude. The linear mode is followed through rising amplitudes, so that no start is needed;
-    the result is a differentiable function of `model` and `velocities` by the implicit function
-    theorem, in forward and in reverse mode and again. Made for residuals of a fit: with
-    `snrmjax.condense` the backbone by the dimensions of a structure.
+    with |V₁| = the velocity at the first sensor: the backbone, natural frequency over amplitude.
+    The linear mode is continued through rising amplitudes, so that no start is needed. By the
+    implicit function theorem the result is differentiable by `model` and `velocities`, in forward
+    and reverse mode and repeatedly. Intended for the residuals of a fit, with `snrmjax.condense`
+    of the dimensions of a structure.
 
     Arguments: `velocities` in m/s, in any order; `steps` between one amplitude and the next.
-    Returns a `PeriodicMotion` with one motion a velocity; NaN, as are its derivatives, where the
-    mode was not found, and at all larger velocities then. Raises `ValueError` for a velocity that
-    is not positive, fewer than one step, and a first sensor that does not see the mode.
-    Validity: where the mode turns back in amplitude (at the tip of an internal resonance) it is not
-    found, or a narrow tongue is stepped over; `nonlinear_normal_mode` traces such curves.
+    Returns a `PeriodicMotion` with one motion per velocity; NaN, with NaN derivatives, where the
+    mode did not converge and at all larger velocities. Raises `ValueError` for a velocity that is
+    not positive, fewer than one step, and a first sensor that does not see the mode.
+    Validity: at a turning point in amplitude (the tip of an internal resonance) it does not
+    converge, or steps over a narrow tongue; `nonlinear_normal_mode` traces such curves.
     Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
     doi:10.1016/j.ymssp.2008.04.002.
 
@@ -74,17 +74,17 @@ def _at_velocities(
     model = dataclasses.replace(model, effects=kept)
     modes, j = model.modes, model.modes.mode_of_interest
     unit = jnp.abs(modes.natural_frequency[j] * modes.mode_shape[0, j])
-    sizes = jax.lax.stop_gradient(velocities / unit)
+    amplitudes = jax.lax.stop_gradient(velocities / unit)
     balance = harmonic_balance(
-        model, 0.0, jnp.max(sizes), harmonic_order=harmonic_order, cosine_only=True
+        model, 0.0, jnp.max(amplitudes), harmonic_order=harmonic_order, cosine_only=True
     )
     order = jnp.argsort(velocities)
-    guesses, found = _followed(*jax.lax.stop_gradient((balance, velocities[order])), steps)
+    guesses, converged = _continued(*jax.lax.stop_gradient((balance, velocities[order])), steps)
 
-    def motion_at(guess: Array, known: Array, velocity: Array, size: Array) -> PeriodicMotion:
-        # With a scale of its own a small motion has all its digits beside a large one.
-        scaled = dataclasses.replace(balance, displacement_scale=size)
-        guess = guess.at[:-1].multiply(balance.displacement_scale / size)
+    def motion_at(guess: Array, known: Array, velocity: Array, amplitude: Array) -> PeriodicMotion:
+        # Scaled by its own amplitude a small motion is as accurate as a large one.
+        scaled = dataclasses.replace(balance, displacement_scale=amplitude)
+        guess = guess.at[:-1].multiply(balance.displacement_scale / amplitude)
         start = jnp.where(known, guess, jnp.nan)
         point, converged = root_of(scaled, _velocity_test, velocity, start, _ITERATIONS)
         cosines, omega = scaled.coefficients(point), point[-1] * balance.frequency_scale
@@ -93,13 +93,13 @@ def _at_velocities(
         given = model, velocity
         return PeriodicMotion(*nan_unless(converged, (omega, whole, phasors), given), converged)
 
-    motions = mapped(motion_at, guesses, found, velocities[order], sizes[order])
+    motions = mapped(motion_at, guesses, converged, velocities[order], amplitudes[order])
     back = jnp.argsort(order)
     return jax.tree.map(lambda part: part[back], motions)
 
 
 def _velocity_test(balance: HarmonicBalance, velocity: Array, point: Array) -> Array:
-    """What vanishes at the wanted velocity: of the first sensor, towards the linear mode's side."""
+    """Zero at the prescribed velocity of the first sensor, with the sign of the linear mode."""
     model = balance.model
     shape, j = model.modes.mode_shape[0], model.modes.mode_of_interest
     cosine = point[:-1].reshape(balance.n_coefficients, -1)[1]
@@ -107,10 +107,10 @@ def _velocity_test(balance: HarmonicBalance, velocity: Array, point: Array) -> A
     return point[-1] * (cosine @ shape) * jnp.sign(shape[j]) / jnp.abs(shape[j]) - (velocity / unit)
 
 
-def _followed(
+def _continued(
     balance: HarmonicBalance, velocities: Float[Array, " velocity"], steps: int
 ) -> tuple[Float[Array, "velocity unknown"], Array]:
-    """Points of the mode at rising velocities, and which of them were found."""
+    """Points of the mode at rising velocities, and which of them converged."""
     model = balance.model
     n, j = model.n_modes, model.modes.mode_of_interest
     shape = jnp.abs(model.modes.mode_shape[0, j])
@@ -126,7 +126,7 @@ def _followed(
         ahead = point + slope * (level - last)
         new, converged = root_of(balance, _velocity_test, level, ahead, _ITERATIONS)
         far, off = (jnp.max(jnp.abs((new - p)[:-1])) for p in (point, ahead))
-        near = (off <= _LATE * far) & (jnp.abs(new[-1] - ahead[-1]) <= _TURN * ahead[-1])
+        near = (off <= _LATE * far) & (jnp.abs(new[-1] - ahead[-1]) <= _LARGEST_SHIFT * ahead[-1])
         # Equal velocities have equal motions.
         moved = level > last
         good = good & converged & (near | ~moved)

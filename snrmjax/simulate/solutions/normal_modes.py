@@ -32,43 +32,43 @@ from snrmjax.simulate.continuation.response_curve import MotionCurve, motions_of
 from snrmjax.simulate.continuation.stability import Stability, floquet_multipliers, stability_of
 
 DEFAULT_STEPS = StepControl(first=1e-3, largest=0.02, angle=0.06)
-_TONGUE_FRACTION = 0.05  # of the energy, in a harmonic of another mode: an internal resonance
+_TONGUE_FRACTION = 0.05  # energy fraction of a harmonic of another mode at internal resonance
 
 
 class Tongue(NamedTuple):
-    """A stretch of a normal mode on which a harmonic of it drives another mode in resonance."""
+    """A section of a normal mode in internal resonance: a harmonic drives another mode."""
 
     mode: int  # the other mode, counted from zero
     harmonic: int
-    from_frequency: float  # rad/s, lowest on the stretch
+    from_frequency: float  # rad/s, lowest on the section
     to_frequency: float  # rad/s, highest
-    energy_fraction: float  # largest share of the kinetic energy in that harmonic of that mode
-    first: int  # index of its first point on the branch; with "skip", of the first one behind it
+    energy_fraction: float  # largest fraction of kinetic energy in that harmonic of that mode
+    first: int  # index of its first point on the branch; with "skip", of the first one after it
     last: int  # index of its last point; with "skip", of the last one before it
 
     @property
     def name(self) -> str:
-        """The resonance as one says it, modes counted from one: "1:3 with mode 2"."""
+        """The resonance as text, modes counted from one: "1:3 with mode 2"."""
         return f"1:{self.harmonic} with mode {self.mode + 1}"
 
 
 class NormalModeBranch(MotionCurve):
-    """A nonlinear normal mode as a curve of periodic motions, from small amplitude on.
+    """A nonlinear normal mode as a curve of periodic motions from small amplitude.
 
-    Its motions start from rest: the coefficients are those of the mean and of cosines.
+    Its motions start from rest: the coefficients are the mean and the cosines.
     """
 
     energy: Float[np.ndarray, " point"] = quantity("point", "J", "energy of the motion")
     mode_fraction: Float[np.ndarray, "point mode"] = quantity(
-        "point mode", "1", "share of the mean kinetic energy"
+        "point mode", "1", "fraction of the mean kinetic energy"
     )
     tongues: tuple[Tongue, ...] = ()
-    # Those of the flow and of the energy, which are one, left out; None: not asked for.
+    # Without the two trivial ones (shifts in time and energy); None: not requested.
     multipliers: Complex[np.ndarray, "point multiplier"] | None = None
 
     @property
     def stability(self) -> Int[np.ndarray, " point"]:
-        """A `Stability` of every point: small disturbances of a stable motion do not grow."""
+        """A `Stability` of every point."""
         if self.multipliers is None:
             return np.full(len(self.frequency), int(Stability.NOT_COMPUTED))
         if not self.multipliers.shape[1]:
@@ -76,14 +76,14 @@ class NormalModeBranch(MotionCurve):
         return stability_of(self.multipliers)
 
     def shape(self, sensor: int = 0) -> Float[np.ndarray, "point sensor"]:
-        """Velocity fundamentals (m/s) at the sensors, that of one of them taken as positive."""
-        # Motions that start from rest have velocities of sines alone.
+        """Velocity fundamentals (m/s) at the sensors, with that of `sensor` positive."""
+        # Motions that start from rest have only sine terms in the velocity.
         speed = self.velocity[:, 1].imag
         return speed * np.where(speed[:, sensor] < 0, -1.0, 1.0)[:, None]
 
     @property
     def resonance(self) -> tuple[str, ...]:
-        """The name of the tongue that every point is on; empty on the backbone."""
+        """The name of the tongue of every point; empty on the backbone."""
         return tuple(
             next((t.name for t in self.tongues if t.first <= k <= t.last), "")
             for k in range(len(self.frequency))
@@ -106,20 +106,20 @@ def nonlinear_normal_mode(
     """Trace the nonlinear normal mode that starts at the linear mode of interest.
 
     Solves m q̈ + k q + ∂V/∂q = 0 (damping, friction, and forces that depend on velocity, left out)
-    for motions q = Σ a_h cos hΩt, which covers every motion that starts from rest; the
-    curve is traced by arclength through folds and internal-resonance tongues.
+    for motions q = Σ a_h cos hΩt, that is, all motions that start from rest; the curve is traced
+    by pseudo-arclength continuation through folds and internal-resonance tongues.
 
     Arguments: `to_frequency` in rad/s, on either side of the linear frequency: the curve ends
-    when it crosses it. `largest_amplitude` (kg^1/2 m; by default 30 times the displacement at
+    where it crosses it. `largest_amplitude` (kg^1/2 m; by default 30 times the displacement at
     which the mode's own nonlinearity matters) ends a curve that never does. A curve that first
     moves away from `to_frequency` is traced as long as it stays above a tenth and below ten
     times the linear frequency.
-    Where a harmonic of the mode meets another mode, the curve runs out on a tongue and back: more
-    than a twentieth of the energy is then in that harmonic of that mode. Tongues are reported;
-    with `tongues="skip"` their points are left out, which leaves the backbone in pieces of one
-    curve. With `stability` Floquet multipliers say whether the motions are orbitally stable: two
-    of them, for shifts in time and in energy, are one and left out.
-    Returns a `NormalModeBranch` whose `status` says how it ended.
+    Where a harmonic of the mode resonates with another mode, the curve follows a tongue out and
+    back: more than a twentieth of the energy is then in that harmonic of that mode. Tongues are
+    reported; with `tongues="skip"` their points are left out, so that only the sections of the
+    backbone remain. With `stability` Floquet multipliers determine orbital stability; the two
+    trivial ones, for shifts in time and in energy, are left out.
+    Returns a `NormalModeBranch` whose `status` is how it ended.
     Raises `ValueError` for a frequency that is not positive or the linear one.
     Not differentiable: differentiate `snrmjax.simulate.normal_mode_at_velocities`.
     Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
@@ -148,9 +148,9 @@ def nonlinear_normal_mode(
     fraction = _kinetic_fractions(balance, cosines)
     multipliers = None
     if stability:
-        found = floquet_multipliers(model, with_sines(cosines), frequency)
-        trivial = np.argsort(np.abs(found - 1), axis=1)
-        multipliers = np.take_along_axis(found, trivial[:, 2:], axis=1)
+        every = floquet_multipliers(model, with_sines(cosines), frequency)
+        trivial = np.argsort(np.abs(every - 1), axis=1)
+        multipliers = np.take_along_axis(every, trivial[:, 2:], axis=1)
     branch = NormalModeBranch(
         **motions_of(balance, curve.points),
         status=curve.status,
@@ -169,8 +169,8 @@ def conservative(model: Structure) -> Structure:
         if not isinstance(effect, AbstractForce):
             return True
         shape = shape_of(type(effect))
-        of_place = shape is not None and shape.argument is Argument.DISPLACEMENT
-        return isinstance(effect, AbstractMemoryless) and of_place
+        elastic = shape is not None and shape.argument is Argument.DISPLACEMENT
+        return isinstance(effect, AbstractMemoryless) and elastic
 
     def with_ratio(ratio: Array) -> Structure:
         modes = dataclasses.replace(model.modes, damping_ratio=ratio, damping_coupling=None)
@@ -178,9 +178,9 @@ def conservative(model: Structure) -> Structure:
 
     effects = tuple(effect for effect in model.effects if stays(effect))
     ones = as_numpy(np.ones(model.n_modes))
-    # Damping ratios that cancel what linear changes add, which depends linearly on them.
+    # Damping ratios that cancel the damping of linear changes, which is linear in them.
     none, whole = (as_numpy(linear_terms_of(with_ratio(k * ones)).damping) for k in (0.0, 1.0))
-    changes = none != whole  # not of a mode of zero frequency, whose damping is no ratio
+    changes = none != whole  # not for a mode of zero frequency, whose damping is not a ratio
     return with_ratio(jnp.asarray(none / np.where(changes, none - whole, 1.0)))
 
 
@@ -188,7 +188,7 @@ def conservative(model: Structure) -> Structure:
 def _trace(balance: HarmonicBalance, ends: Array, steps: StepControl) -> Curve:
     j = balance.model.modes.mode_of_interest
     modes, n = balance.model.modes, balance.model.n_modes
-    # Start a little up the mode, where Newton's method at fixed amplitude is well posed.
+    # Start at a small amplitude, where Newton's method at fixed amplitude is well posed.
     size = balance.size + 1
     linear = jnp.zeros(size).at[-1].set(modes.natural_frequency[j] / balance.frequency_scale)
     direction = jnp.zeros(size).at[n + j].set(1.0)
@@ -206,7 +206,7 @@ def _trace(balance: HarmonicBalance, ends: Array, steps: StepControl) -> Curve:
 def _kinetic_fractions(
     balance: HarmonicBalance, coefficients: Float[np.ndarray, "point coefficient mode"]
 ) -> Float[np.ndarray, "point coefficient mode"]:
-    """The share of every harmonic of every mode in the mean kinetic energy."""
+    """Fraction of every harmonic of every mode in the mean kinetic energy."""
     order = np.arange(coefficients.shape[1])[:, None]
     mass = np.asarray(linear_terms_of(balance.model).mass)
     energy = mass * (order * coefficients) ** 2  # twice the mean, over Ω²
@@ -218,38 +218,38 @@ def _tongues(
     frequency: np.ndarray,
     energy_fraction: Float[np.ndarray, "point coefficient mode"],
 ) -> tuple[Tongue, ...]:
-    """Stretches with more than `_TONGUE_FRACTION` of the kinetic energy in one other pair."""
+    """Sections with more than `_TONGUE_FRACTION` of the energy in a harmonic of another mode."""
     j, fraction = model.modes.mode_of_interest, energy_fraction.copy()
-    # The mode's own harmonics are its shape in time; others' fundamentals its shape in space.
+    # Own harmonics are the waveform of the mode, fundamentals of other modes its shape.
     fraction[:, :, j] = 0.0
     fraction[:, :2] = 0.0
     strongest = fraction.max(axis=(1, 2))
     inside = np.concatenate([[False], strongest > _TONGUE_FRACTION, [False]])
     edges = np.flatnonzero(np.diff(inside.astype(int)))
-    found = []
+    tongues = []
     for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        stretch = fraction[first:stop].max(axis=0)
-        harmonic, mode = np.unravel_index(np.argmax(stretch), stretch.shape)
-        found.append(
+        section = fraction[first:stop].max(axis=0)
+        harmonic, mode = np.unravel_index(np.argmax(section), section.shape)
+        tongues.append(
             Tongue(
                 mode=int(mode),
                 harmonic=int(harmonic),
                 from_frequency=float(frequency[first:stop].min()),
                 to_frequency=float(frequency[first:stop].max()),
-                energy_fraction=float(stretch.max()),
+                energy_fraction=float(section.max()),
                 first=first,
                 last=stop - 1,
             )
         )
-    return tuple(found)
+    return tuple(tongues)
 
 
 def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
-    """The branch without the points of its tongues, which say between which points they were."""
+    """The branch without the points of its tongues, whose indices then mark the gaps."""
     keep = np.ones(len(branch.frequency), dtype=bool)
     for tongue in branch.tongues:
         keep[tongue.first : tongue.last + 1] = False
-    place = np.cumsum(keep)  # points that are kept up to and with each
+    count = np.cumsum(keep)  # points kept up to and including each
     return dataclasses.replace(
         branch,
         frequency=branch.frequency[keep],
@@ -259,7 +259,7 @@ def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
         mode_fraction=branch.mode_fraction[keep],
         multipliers=None if branch.multipliers is None else branch.multipliers[keep],
         tongues=tuple(
-            tongue._replace(first=int(place[tongue.first]), last=int(place[tongue.first]) - 1)
+            tongue._replace(first=int(count[tongue.first]), last=int(count[tongue.first]) - 1)
             for tongue in branch.tongues
         ),
     )

@@ -22,7 +22,7 @@ Condition = Literal["frequency", "velocity", "fold", "peak", "phase_resonance"]
 
 
 class PeriodicMotion(AbstractResult):
-    """A periodic motion, or a batch of them; NaN where none was found."""
+    """A periodic motion, or a batch of them; NaN if not converged."""
 
     coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz",)
 
@@ -34,7 +34,7 @@ class PeriodicMotion(AbstractResult):
     @property
     def amplitude(self) -> Float[Array, "*batch"]:
         """|velocity fundamental| at the first sensor, in m/s."""
-        # The derivative of |NaN| would be NaN for all that share a parameter with it.
+        # The derivative of |NaN| would be NaN for all motions that share its parameters.
         fundamental = self.velocity[..., 1, 0]
         phasor = jnp.where(self.converged, fundamental, 1.0)
         return jnp.where(self.converged, jnp.abs(phasor), fundamental.real)
@@ -45,7 +45,7 @@ class PeriodicMotion(AbstractResult):
         return batch_variables(
             self.velocity,
             frequency_hz=(hertz, "Hz", "frequency"),
-            converged=(self.converged, "1", "whether the motion was found"),
+            converged=(self.converged, "1", "whether the solution converged"),
         )
 
 
@@ -58,7 +58,7 @@ def periodic_motion(
     value: float | Float[ArrayLike, ""] | None = None,
     iterations: int = 30,
 ) -> PeriodicMotion:
-    """The periodic motion near `start` that meets one condition, differentiable.
+    """The periodic motion near `start` that satisfies one condition, differentiable.
 
     Solves the harmonic balance together with Ω = `value` ("frequency"), |V₁| = `value` at the
     first sensor ("velocity"), dΩ/ds = 0 ("fold"), d|V₁|/ds = 0 ("peak") or Im V₁ = 0 of the mode
@@ -66,18 +66,17 @@ def periodic_motion(
     method with exact derivatives. The result is a differentiable function of every number of
     `model`, of `force` and of `value`, by the implicit function theorem: in forward and in reverse
     mode, and of second order (a Hessian times a vector is `jax.jvp` of `jax.grad`). `start`
-    (coefficients in kg^1/2 m and frequency in rad/s, such as `ResponseCurve.point`) only says
-    which solution is meant: nothing is differentiable by it.
+    (coefficients in kg^1/2 m and frequency in rad/s, such as `ResponseCurve.point`) only selects
+    the solution: derivatives by it are zero.
 
     Arguments: `force` in N; `value` in rad/s or m/s.
-    Returns a `PeriodicMotion`, for `jax.jit` and `jax.vmap` too (models of one kind: the same
-    modes, monomials and effects; all take as many iterations as the slowest). Where Newton's method
-    did not converge its values are NaN, and so are their derivatives: start nearer, or use
-    `TrackedMotion`. Members of a batch that a result leaves out add nothing to its derivatives;
-    leave them out before computing on, by `jnp.where(found.converged, found.frequency, 1.0)`.
-    From a start that is far away Newton's method may converge to another motion: in an
-    optimisation, use `TrackedMotion`.
-    Raises `ValueError` for an unknown condition and for a missing or needless `value`.
+    Returns a `PeriodicMotion`, also under `jax.jit` and `jax.vmap` (models with the same modes,
+    monomials and effects; all take as many iterations as the slowest). If Newton's method did not
+    converge its values and their derivatives are NaN: start nearer, or use `TrackedMotion`.
+    Members of a batch that a result leaves out add nothing to its derivatives; mask them before
+    further computation, by `jnp.where(motion.converged, motion.frequency, 1.0)`. From a distant
+    start Newton's method may converge to another motion: in an optimisation use `TrackedMotion`.
+    Raises `ValueError` for an unknown condition and for a missing or superfluous `value`.
 
     >>> from snrmjax import forced_response
     >>> from snrmjax.model import flat_beam
@@ -108,14 +107,14 @@ def motion_near(
     value: Float[Array, ""] | None,
     iterations: int,
 ) -> PeriodicMotion:
-    """`periodic_motion` of arrays, without its checks."""
+    """`periodic_motion` for arrays, without its checks."""
     given = model, force, value
     model = simulated_structure(model)
     coefficients, frequency = (jax.lax.stop_gradient(part) for part in start)
     largest = jnp.max(jnp.abs(coefficients))
     target = jnp.zeros(()) if value is None else value
-    # What is not finite is computed with harmless numbers and counts as not found: in a
-    # derivative `where` does not stop a NaN that was computed.
+    # Non-finite input is replaced by harmless numbers and counts as not converged: in derivatives
+    # `where` does not mask a NaN that was computed.
     usable = jnp.isfinite(force) & jnp.isfinite(target) & jnp.isfinite(largest) & (largest > 0)
     force, target, scale = (jnp.where(usable, part, 1.0) for part in (force, target, largest))
     order = (coefficients.shape[0] - 1) // 2
@@ -123,17 +122,17 @@ def motion_near(
     guess = jnp.where(usable, balance.point(coefficients, frequency), jnp.nan)
     guess = jax.lax.stop_gradient(guess)
     point, converged = _solved(balance, guess, condition, target, iterations)
-    found = balance.coefficients(point)
+    solution = balance.coefficients(point)
     omega = point[-1] * balance.frequency_scale
-    velocity = velocity_phasors(found, omega, model.modes.mode_shape)
-    # Masked last: a NaN within would make the derivatives of a whole batch NaN.
-    return PeriodicMotion(*nan_unless(converged, (omega, found, velocity), given), converged)
+    velocity = velocity_phasors(solution, omega, model.modes.mode_shape)
+    # Masked last: a NaN inside would make the derivatives of a whole batch NaN.
+    return PeriodicMotion(*nan_unless(converged, (omega, solution, velocity), given), converged)
 
 
 def _solved(
     balance: HarmonicBalance, guess: Point, condition: Condition, target: Array, iterations: int
 ) -> tuple[Point, Array]:
-    """The root of the balance and the condition, and whether it was found: see `root_of`."""
+    """The root of the balance and the condition, and whether it converged: see `root_of`."""
     harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
     border = _tangent_near(balance.linearised, harmless, _generic(guess.shape[0]))
     border = jax.lax.stop_gradient(border)
@@ -151,10 +150,10 @@ def root_of(
     guess: Point,
     iterations: int,
 ) -> tuple[Point, Array]:
-    """The root of the balance and of `test(balance, target, point)`, and whether it was found.
+    """The root of the balance and of `test(balance, target, point)`, and whether it converged.
 
-    Differentiable by `balance` and `target`. Where it was not found the point is the guess, and the
-    derivatives are zero: what is made of it passes through `nan_unless`.
+    Differentiable by `balance` and `target`. If it did not converge the point is the guess with
+    zero derivatives: pass results computed from it through `nan_unless`.
     """
     harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
     fixed, aim = jax.lax.stop_gradient((balance, target))
@@ -165,33 +164,33 @@ def root_of(
         value, slope = jax.value_and_grad(lambda p: test(fixed, aim, p))(point)
         matrix = jnp.concatenate([jacobian, slope[None]])
         step = jnp.linalg.solve(matrix, jnp.append(residual, value))
-        size = jnp.max(jnp.abs(step))
-        return point - step, count + 1, size, jnp.isfinite(size)
+        change = jnp.max(jnp.abs(step))
+        return point - step, count + 1, change, jnp.isfinite(change)
 
     def going(state: tuple) -> Array:
-        _, count, size, finite = state
-        return finite & (count < iterations) & (size > 1e-12)
+        _, count, change, finite = state
+        return finite & (count < iterations) & (change > 1e-12)
 
     state = (guess, jnp.array(0), jnp.array(jnp.inf), jnp.array(True))
-    point, _, size, finite = jax.lax.while_loop(going, body, state)
-    converged = finite & (size < 1e-8)
+    point, _, change, finite = jax.lax.while_loop(going, body, state)
+    converged = finite & (change < 1e-8)
     root = jax.lax.stop_gradient(jnp.where(converged, point, harmless))
 
     def equations(point: Point) -> Array:
-        left = jnp.append(balance.residual(point), test(balance, target, point))
-        return jnp.where(converged, left, point - harmless)
+        residual = jnp.append(balance.residual(point), test(balance, target, point))
+        return jnp.where(converged, residual, point - harmless)
 
     def tangent_solve(linear: Callable[[Array], Array], right: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(right), right)
 
-    # The root is known: this gives it the derivatives of the implicit function theorem.
+    # The root is known: this attaches the derivatives of the implicit function theorem.
     return jax.lax.custom_root(equations, root, lambda _, known: known, tangent_solve), converged
 
 
 def _test(
     balance: HarmonicBalance, condition: Condition, target: Array, border: Point, point: Point
 ) -> Array:
-    """What vanishes where the condition is met."""
+    """The residual of the condition."""
     if condition == "frequency":
         return point[-1] - target / balance.frequency_scale
     if condition == "velocity":
@@ -220,5 +219,5 @@ def _tangent_near(linearised: Linearised, point: Point, border: Point) -> Point:
 
 
 def _generic(size: int) -> Point:
-    """A direction that no tangent is across, but by chance."""
+    """A random direction, which no tangent is orthogonal to in practice."""
     return jnp.asarray(np.random.default_rng(size).normal(size=size) / np.sqrt(size))

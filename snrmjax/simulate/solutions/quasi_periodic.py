@@ -31,9 +31,9 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 
 DEFAULT_STEPS = StepControl(first=0.02, smallest=1e-6, largest=0.1, angle=0.2, max_points=300)
 _MOST_MODES = 20
-_FIRST_SIZE = 1e-3  # of the modulation, in scaled unknowns, at the first point
-_SLOW_SAMPLES = 64  # over a slow period, among which amplitudes are compared
-_ON_CIRCLE = 0.02  # distance from the unit circle of the multipliers that cross it, at most
+_FIRST_MODULATION = 1e-3  # amplitude at the first point, in scaled unknowns
+_SLOW_SAMPLES = 64  # over a slow period, for its least and largest amplitude
+_ON_CIRCLE = 0.02  # largest distance of the crossing multipliers from the unit circle
 
 
 class TorusEnd(Status):
@@ -49,10 +49,10 @@ class TorusEnd(Status):
 
 
 class QuasiPeriodicBranch(AbstractResult):
-    """Motions with two base frequencies in order along a branch, stable or not.
+    """Motions with two base frequencies along a branch, stable or not.
 
     The first point is the Neimark-Sacker bifurcation itself. Velocities are those that the sensors
-    record, with the base's own where they see it.
+    record, including that of the base where they record it.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("sensor",)
@@ -86,7 +86,7 @@ class QuasiPeriodicBranch(AbstractResult):
 
     @property
     def force_unit(self) -> str:
-        """Unit of what drives it: newtons, m/s² of a base, or a number of unbalances."""
+        """Unit of the excitation: newtons, m/s² of a base, or a number of unbalances."""
         return drive_unit(self.base, self.unbalance)
 
     @property
@@ -95,11 +95,11 @@ class QuasiPeriodicBranch(AbstractResult):
         return 2 * np.pi / self.slow_frequency
 
     def ends_at(self, frequency: float) -> bool:
-        """Whether it ends at a Neimark-Sacker point of this frequency (rad/s), to its last step."""
+        """Whether it ends at a Neimark-Sacker point of this frequency (rad/s), within a step."""
         if self.status != TorusEnd.PERIODIC:
             return False
         step = abs(float(self.frequency[-1] - self.frequency[-2]))
-        if len(self.frequency) > 2:  # the last one is between two whole steps
+        if len(self.frequency) > 2:  # the last point lies within a step
             step = max(step, abs(float(self.frequency[-2] - self.frequency[-3])))
         return abs(float(self.frequency[-1]) - frequency) <= step
 
@@ -128,18 +128,17 @@ def quasi_periodic_branch(
     slow_order: int = 3,
     steps: StepControl = DEFAULT_STEPS,
 ) -> QuasiPeriodicBranch:
-    """Follow the quasi-periodic motions that begin at a Neimark-Sacker point of a response.
+    """Trace the quasi-periodic motions that bifurcate at a Neimark-Sacker point of a response.
 
-    There a second frequency ω appears, and a motion with two phases, Ωt and ωt, branches off. It is
-    followed in the frequency of the force by a harmonic balance in both, with the response's
-    harmonics of Ω and `slow_order` of ω, until the modulation vanishes at another such point.
-    Motions that lock (ω a simple fraction of Ω) are passed as if they did not. Whether the motions
-    are stable is not computed; where the branch leaves towards frequencies at which the response
-    is unstable they are as a rule.
+    A motion with two phases, Ωt and ωt, branches off there. It is continued in the frequency of
+    the force by a harmonic balance in both frequencies, with the response's harmonics of Ω and
+    `slow_order` of ω, until the modulation vanishes at another such point. Phase locking (ω a
+    simple fraction of Ω) is ignored. Stability is not computed; as a rule the motions are stable
+    where the branch leaves towards frequencies at which the response is unstable.
 
     Arguments: the `model` of the response; the index of the `event` in it, by default its first
     Neimark-Sacker point; `within`, frequencies in rad/s where the branch ends, by default those of
-    the response. At most 20 modes, no friction with memory.
+    the response. At most 20 modes, no friction with internal variables.
     Raises `ValueError` for a response without such a point and for models beyond these limits.
     Not differentiable; periodic motions are: `snrmjax.simulate.periodic_motion`.
     Reference: Guillot, Cochelin & Vergez, Nonlinear Dyn. 97 (2019) 1711 (two base frequencies);
@@ -150,8 +149,8 @@ def quasi_periodic_branch(
     if slow_order < 1:
         raise ValueError(f"`slow_order` must be 1 or more, but is {slow_order}.")
     ns_points = response.at_events("neimark_sacker")
-    place = event if event is not None else (int(ns_points[0]) if len(ns_points) else None)
-    if place is None or place not in ns_points or response.multipliers is None:
+    index = event if event is not None else (int(ns_points[0]) if len(ns_points) else None)
+    if index is None or index not in ns_points or response.multipliers is None:
         raise ValueError("`response` has no Neimark-Sacker point there: see `at_events`.")
     ends = within or (float(response.frequency.min()), float(response.frequency.max()))
     lower, upper = frequency_range(*ends)
@@ -163,17 +162,17 @@ def quasi_periodic_branch(
         resonance_displacement(model, response.force),
         harmonic_order=order,
     )
-    start, direction, phase = _beginning(balance, response, place, slow_order)
+    start, direction, phase = _beginning(balance, response, index, slow_order)
     torus = TorusBalance(balance, jnp.asarray(phase), slow_order)
     scale = float(balance.frequency_scale)
-    points, status = _followed(torus, start, direction, (lower / scale, upper / scale), steps)
+    points, status = _traced(torus, start, direction, (lower / scale, upper / scale), steps)
     return _as_result(torus, points, status)
 
 
 def check_quasi_periodic(model: Structure) -> None:
-    """Raise `ValueError` for a model whose quasi-periodic motions cannot be followed, and say why.
+    """Raise `ValueError` for a model whose quasi-periodic motions cannot be traced.
 
-    At most 20 modes, no friction with memory.
+    At most 20 modes, no friction with internal variables.
     """
     if model.n_modes > _MOST_MODES:
         raise ValueError(
@@ -182,29 +181,31 @@ def check_quasi_periodic(model: Structure) -> None:
         )
     if model.hysteretic:
         kinds = ", ".join(effect.kind for effect in model.hysteretic)
-        raise ValueError(f"quasi-periodic motions with a memory ({kinds}) cannot be followed.")
+        raise ValueError(
+            f"quasi-periodic motions with internal variables ({kinds}) cannot be followed."
+        )
 
 
 def _beginning(
-    balance: HarmonicBalance, response: ResponseCurve, place: int, slow_order: int
+    balance: HarmonicBalance, response: ResponseCurve, index: int, slow_order: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The point of the bifurcation, the way onto the branch, and what fixes the second phase.
+    """The bifurcation point, the direction onto the branch, and the second phase condition.
 
-    With the second frequency of the multipliers, the equations of k₂ = 1 have two solutions there,
-    a quarter of its period apart: either is the way.
+    At the second frequency of the multipliers the equations of k₂ = 1 have two null vectors, a
+    quarter of its period apart: either one is the direction.
     """
-    multipliers = np.asarray(response.multipliers)[place]
-    turning = multipliers[np.abs(multipliers.imag) > 1e-9]
-    if not len(turning) or np.min(np.abs(np.abs(turning) - 1)) > _ON_CIRCLE:
+    multipliers = np.asarray(response.multipliers)[index]
+    oscillating = multipliers[np.abs(multipliers.imag) > 1e-9]
+    if not len(oscillating) or np.min(np.abs(np.abs(oscillating) - 1)) > _ON_CIRCLE:
         raise ValueError("the multipliers of this point do not cross the unit circle in a pair.")
-    crossing = turning[np.argmin(np.abs(np.abs(turning) - 1))]
+    crossing = oscillating[np.argmin(np.abs(np.abs(oscillating) - 1))]
     unit = float(balance.frequency_scale)
-    fast = float(response.frequency[place]) / unit
+    fast = float(response.frequency[index]) / unit
     slow = abs(np.angle(crossing)) / (2 * np.pi) * fast
     blank = TorusBalance(balance, jnp.zeros(1), slow_order)
     size, n = blank.size, balance.model.n_modes
     x = np.zeros(size)
-    x[: balance.size] = response.coefficients[place].reshape(-1) / float(balance.displacement_scale)
+    x[: balance.size] = response.coefficients[index].reshape(-1) / float(balance.displacement_scale)
     start = np.concatenate([x, [slow, fast]])
     torus = TorusBalance(balance, jnp.zeros(size), slow_order)
     jacobian = np.asarray(_linearised(torus, jnp.asarray(start))[1])[:size, :size]
@@ -226,44 +227,44 @@ def _tracer(torus: TorusBalance, within: CurveRange, steps: StepControl) -> Curv
 
 
 @compiled
-def _begun(
+def _initial(
     torus: TorusBalance, within: CurveRange, steps: StepControl, start: Array, direction: Array
 ) -> Tracing:
-    return _tracer(torus, within, steps).begun(start, direction, direction)
+    return _tracer(torus, within, steps).initial(start, direction, direction)
 
 
 @compiled
 def _corrected(
-    torus: TorusBalance, within: CurveRange, steps: StepControl, walk: Tracing
+    torus: TorusBalance, within: CurveRange, steps: StepControl, state: Tracing
 ) -> tuple[Tracing, Array]:
-    return _tracer(torus, within, steps).corrected(walk)
+    return _tracer(torus, within, steps).corrected(state)
 
 
-def _followed(
+def _traced(
     torus: TorusBalance,
     start: np.ndarray,
     direction: np.ndarray,
     ends: tuple[float, float],
     steps: StepControl,
 ) -> tuple[np.ndarray, TorusEnd]:
-    """Points of the branch; one by one, because only the host sees that a modulation vanished."""
+    """Points of the branch, one by one: the host checks whether the modulation vanished."""
     within = CurveRange(*ends)
     slow = np.flatnonzero(np.repeat(torus.basis.slow, torus.balance.model.n_modes))
-    begin = jnp.asarray(start + _FIRST_SIZE * direction)
-    walk, points = _begun(torus, within, steps, begin, jnp.asarray(direction)), [start]
-    while int(walk.status) == RUNNING:
-        walk, kept = _corrected(torus, within, steps, walk)
+    begin = jnp.asarray(start + _FIRST_MODULATION * direction)
+    state, points = _initial(torus, within, steps, begin, jnp.asarray(direction)), [start]
+    while int(state.status) == RUNNING:
+        state, kept = _corrected(torus, within, steps, state)
         if not bool(kept):
             continue
-        new, last = np.asarray(walk.here), points[-1]
+        new, last = np.asarray(state.here), points[-1]
         if len(points) > 2 and new[slow] @ last[slow] < 0:
-            # The other half of the branch is the same motions, half a slow period later.
-            sizes = [np.linalg.norm(part[slow]) for part in (last, new)]
-            fraction = sizes[0] / sum(sizes)
+            # Beyond it the same motions recur, half a slow period later.
+            norms = [np.linalg.norm(part[slow]) for part in (last, new)]
+            fraction = norms[0] / sum(norms)
             points.append(last + fraction * (new - last))
             return np.stack(points), TorusEnd.PERIODIC
         points.append(new)
-    return np.stack(points), TorusEnd(int(walk.status))
+    return np.stack(points), TorusEnd(int(state.status))
 
 
 def _as_result(torus: TorusBalance, points: np.ndarray, status: TorusEnd) -> QuasiPeriodicBranch:
@@ -309,7 +310,7 @@ def _as_result(torus: TorusBalance, points: np.ndarray, status: TorusEnd) -> Qua
 def _amplitudes(
     torus: TorusBalance, velocity: Float[np.ndarray, "coefficient sensor"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the largest amplitude of what goes with τ₁ once, over τ₂."""
+    """The least and the largest amplitude of the fundamental in τ₁ over τ₂."""
     basis = torus.basis
     fast, slow = basis.fast[1::2], basis.slow[1::2]
     phasor = velocity[1::2] - 1j * velocity[2::2]
@@ -318,5 +319,5 @@ def _amplitudes(
     # cos(−τ₁ + k₂τ₂ + φ) is cos(τ₁ − k₂τ₂ − φ).
     envelope = np.exp(1j * tau * slow[ahead]) @ phasor[ahead]
     envelope = envelope + np.exp(-1j * tau * slow[behind]) @ phasor[behind].conj()
-    size = np.abs(envelope)
-    return size.min(axis=0), size.max(axis=0)
+    amplitude = np.abs(envelope)
+    return amplitude.min(axis=0), amplitude.max(axis=0)

@@ -1,4 +1,4 @@
-"""A periodic motion that is carried along as the model and the force change: for optimisations."""
+"""A periodic motion continued as the model and the force change, for optimisations."""
 
 from typing import NamedTuple
 
@@ -18,28 +18,28 @@ from snrmjax.simulate.solutions.periodic_motion import (
     periodic_motion,
 )
 
-_ITERATIONS = 12  # of Newton's method, which starts from a prediction
-_LATE = 0.3  # correction over step, beyond which the step may have gone to another motion
-_ROUNDING = 1e-6  # of the motion: corrections below it are none
-_TURN = 0.1  # of the frequency, in one step
-_SHORTEST = 2.0**-12  # of the way
+_ITERATIONS = 12  # of Newton's method, started from a prediction
+_LATE = 0.3  # largest correction over step: beyond it another motion may have been reached
+_ROUNDING = 1e-6  # relative correction that is negligible
+_LARGEST_SHIFT = 0.1  # relative change of the frequency in one step
+_SHORTEST = 2.0**-12  # step, as a fraction of the path
 _TRIALS = 400
 
 
 class TrackedMotion(eqx.Module):
     """A periodic motion at known parameters, from which it is continued to others.
 
-    `periodic_motion` needs a start near the motion that is meant. In an optimisation the parameters
-    move away from where a start was found, and from there Newton's method ends nowhere or at
-    another motion. `at` goes from the known parameters to the new ones on a straight line, in as
-    many steps as the motion needs: Newton's method corrects what its derivative along the line
-    predicts. The result depends on the new parameters alone, not on those asked for before, and is
-    differentiable as that of `periodic_motion` is: in `jax.jit`, `jax.grad` and `jax.vmap`, in the
-    loops of scipy.optimize and of optimistix.
+    `periodic_motion` needs a start near the wanted motion. In an optimisation the parameters move
+    away from those of the start, from where Newton's method may fail or converge to another motion.
+    `at` continues the motion from the known parameters to the new ones along a straight line, in as
+    many steps as needed: the derivative along the line predicts, Newton's method corrects. The
+    result depends on the new parameters alone, not on earlier calls, and is differentiable like
+    that of `periodic_motion`: in `jax.jit`, `jax.grad` and `jax.vmap`, in the loops of
+    scipy.optimize and of optimistix.
 
-    Arguments: `model`, `force` in N, `start`, `condition` and `value` as `periodic_motion` has
-    them; `start` is corrected.
-    Raises `ValueError` where there is no such motion near `start`, and as `periodic_motion` does.
+    Arguments: `model`, `force` in N, `start`, `condition` and `value` as in `periodic_motion`;
+    `start` is corrected.
+    Raises `ValueError` if there is no such motion near `start`, and as `periodic_motion` does.
 
     >>> import jax
     >>> from snrmjax import forced_response
@@ -84,12 +84,12 @@ class TrackedMotion(eqx.Module):
         *,
         value: float | Float[ArrayLike, ""] | None = None,
     ) -> PeriodicMotion:
-        """The motion at other parameters, differentiable by them; left out, they are the known.
+        """The motion at other parameters, differentiable by them; by default the known ones.
 
-        Returns a `PeriodicMotion`; NaN, with derivatives that are NaN, where the motion ends on the
-        way, as a pair of folds does at a cusp: see where by `follow_event`.
-        Raises `ValueError` for a model of another kind (modes, monomials, effects) and for a
-        needless `value`.
+        Returns a `PeriodicMotion`; NaN, with NaN derivatives, if the motion ceases to exist on the
+        path, as a pair of folds does at a cusp: `follow_event` shows where.
+        Raises `ValueError` for a model with other modes, monomials or effects and for a
+        superfluous `value`.
         """
         if value is not None and self.value is None:
             raise ValueError(f'`condition="{self.condition}"` takes no `value`.')
@@ -100,7 +100,7 @@ class TrackedMotion(eqx.Module):
             self.value if value is None else jnp.asarray(value, dtype=jnp.float64),
         )
         _check_alike(known[0], new[0])
-        return _carried(known, numbers_as_arrays(new), self.motion, self.condition)
+        return _continued(known, numbers_as_arrays(new), self.motion, self.condition)
 
 
 def _check_alike(known: Structure, new: Structure) -> None:
@@ -118,8 +118,8 @@ def _shapes(model: Structure) -> list[tuple[int, ...]]:
     return [np.shape(leaf) for leaf in jax.tree.leaves(model)]
 
 
-class _Way(NamedTuple):
-    """How far along the line a motion was carried: its unknowns, and their derivatives by it."""
+class _Path(NamedTuple):
+    """State of the continuation along the line: position, motion and its derivatives."""
 
     fraction: Float[Array, ""]  # of the line
     motion: tuple[Array, Array]  # coefficients and frequency
@@ -130,53 +130,53 @@ class _Way(NamedTuple):
 
 
 @jitted
-def _carried(
+def _continued(
     known: tuple, new: tuple, motion: PeriodicMotion, condition: Condition
 ) -> PeriodicMotion:
     here, there, begin = jax.lax.stop_gradient((known, new, motion))
-    # By their leaves: what is no number, such as a name, is that of the new parameters.
+    # Leaf by leaf: what is not a number, such as a name, is taken from the new parameters.
     (begins, _), (ends, kind) = jax.tree.flatten(here), jax.tree.flatten(there)
 
     def solved(fraction: Array, start: tuple[Array, Array]) -> tuple[tuple, tuple, Array]:
-        """The motion at a share of the line, its derivatives by that, and whether it was found."""
+        """The motion at a fraction of the line, its derivatives by it, and whether it converged."""
 
         def at(fraction: Array) -> tuple[tuple[Array, Array], Array]:
             moved = [a + fraction * (b - a) for a, b in zip(begins, ends, strict=True)]
             model, force, value = jax.tree.unflatten(kind, moved)
-            found = motion_near(model, force, start, condition, value, _ITERATIONS)
-            return (found.coefficients, found.frequency), found.converged
+            solution = motion_near(model, force, start, condition, value, _ITERATIONS)
+            return (solution.coefficients, solution.frequency), solution.converged
 
         point, slope, good = jax.jvp(at, (fraction,), (jnp.ones_like(fraction),), has_aux=True)
         return point, slope, good
 
-    def body(way: _Way) -> _Way:
-        fraction = jnp.minimum(way.fraction + way.step, 1.0)
-        ahead = fraction - way.fraction
-        guess = jax.tree.map(lambda a, b: a + ahead * b, way.motion, way.slope)
+    def body(path: _Path) -> _Path:
+        fraction = jnp.minimum(path.fraction + path.step, 1.0)
+        ahead = fraction - path.fraction
+        guess = jax.tree.map(lambda a, b: a + ahead * b, path.motion, path.slope)
         point, slope, good = solved(fraction, guess)
-        back = point[0] - ahead * slope[0] - way.motion[0]  # what the new slope does not explain
-        moves = point[0] - way.motion[0], point[0] - guess[0], back
+        back = point[0] - ahead * slope[0] - path.motion[0]  # mismatch of the backward prediction
+        moves = point[0] - path.motion[0], point[0] - guess[0], back
         far, *misses = (jnp.max(jnp.abs(move)) for move in moves)
-        off, size = jnp.maximum(*misses), jnp.max(jnp.abs(way.motion[0]))
-        near = (off <= _LATE * far) | (off <= _ROUNDING * size)
-        near &= jnp.abs(point[1] - way.motion[1]) <= _TURN * way.motion[1]
+        off, amplitude = jnp.maximum(*misses), jnp.max(jnp.abs(path.motion[0]))
+        near = (off <= _LATE * far) | (off <= _ROUNDING * amplitude)
+        near &= jnp.abs(point[1] - path.motion[1]) <= _LARGEST_SHIFT * path.motion[1]
         good &= near
         longer = jnp.where(off <= 0.3 * _LATE * far, 2.0, 1.0)
-        onward = _Way(
-            fraction, point, slope, jnp.where(good, longer, 0.5) * way.step, way.trials + 1, good
+        onward = _Path(
+            fraction, point, slope, jnp.where(good, longer, 0.5) * path.step, path.trials + 1, good
         )
-        kept = way._replace(step=0.5 * way.step, trials=way.trials + 1)
+        kept = path._replace(step=0.5 * path.step, trials=path.trials + 1)
         return jax.tree.map(lambda a, b: jnp.where(good, a, b), onward, kept)
 
-    def going(way: _Way) -> Array:
-        unfinished = way.known & (way.fraction < 1.0)
-        return unfinished & (way.step >= _SHORTEST) & (way.trials < _TRIALS)
+    def going(path: _Path) -> Array:
+        unfinished = path.known & (path.fraction < 1.0)
+        return unfinished & (path.step >= _SHORTEST) & (path.trials < _TRIALS)
 
     zero = jnp.zeros(())
     start, slope, good = solved(zero, (begin.coefficients, begin.frequency))
-    way = _Way(zero, start, slope, jnp.ones(()), jnp.zeros((), dtype=int), good)
-    way = jax.lax.while_loop(going, body, way)
-    arrived = way.known & (way.fraction >= 1.0)
-    end = jax.tree.map(lambda a: jnp.where(arrived, a, jnp.nan), way.motion)
+    path = _Path(zero, start, slope, jnp.ones(()), jnp.zeros((), dtype=int), good)
+    path = jax.lax.while_loop(going, body, path)
+    arrived = path.known & (path.fraction >= 1.0)
+    end = jax.tree.map(lambda a: jnp.where(arrived, a, jnp.nan), path.motion)
     model, force, value = new
     return motion_near(model, force, end, condition, value, _ITERATIONS)

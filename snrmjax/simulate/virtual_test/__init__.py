@@ -1,1 +1,1 @@
-"""Virtual tests: which states a test visits, and what its instruments record of them."""
+"""Virtual tests: the states that a test visits, and the records of its instruments."""

@@ -1,4 +1,4 @@
-"""States at given phases of the mode of interest: where a test records, and what is there."""
+"""States at given phases of the mode of interest, at which a test near resonance records."""
 
 from collections.abc import Sequence
 
@@ -38,12 +38,12 @@ def mode_phase(
 
 
 def around(phase: Float[np.ndarray, " point"], centre: int, largest: float) -> np.ndarray:
-    """Points from `centre` on, either way, until the phase is too far off.
+    """Points on either side of `centre` up to the largest |phase|.
 
-    At a superharmonic resonance, far below, the phase may come back into the range: no test for
-    the mode would look there.
+    At a superharmonic resonance, far below, the phase may re-enter the range: a test of the mode
+    does not record there.
     """
-    # One point beyond the limit is kept on either side: states lie between points.
+    # One point beyond the limit is kept on either side, since states are interpolated.
     far = np.flatnonzero(np.abs(phase) > largest)
     below, above = far[far < centre], far[far > centre]
     first = below[-1] if below.size else 0
@@ -55,10 +55,10 @@ def around(phase: Float[np.ndarray, " point"], centre: int, largest: float) -> n
 def spread_in_phase(
     phase: np.ndarray, reached: np.ndarray, smallest: float, largest: float, count: int
 ) -> list[tuple[int, float]]:
-    """Places (point, share of the way to the next) on a curve with |phase| inside a range.
+    """Positions (point, fraction of the step to the next) on a curve with |phase| in a range.
 
-    `count` of them, shared among the sides of resonance and spread evenly in phase over what is
-    reached of a side, so that none lies in a gap between two branches.
+    `count` of them, divided between the sides of resonance and spread evenly in phase over the
+    part of a side that is reached, so that none lies in a gap between two branches.
     """
     pair = np.flatnonzero(reached[:-1] & reached[1:] & (np.abs(np.diff(phase)) < 1.0))
     sides = []
@@ -67,7 +67,7 @@ def spread_in_phase(
         used = begin != end
         if used.any():
             sides.append((pair[used], sign * begin[used], sign * end[used]))
-    places: list[tuple[int, float]] = []
+    positions: list[tuple[int, float]] = []
     for k, (here, begin, end) in enumerate(sides):
         n = len(np.array_split(np.arange(count), len(sides))[k])
         along = np.concatenate([[0.0], np.cumsum(np.abs(end - begin))])
@@ -75,37 +75,37 @@ def spread_in_phase(
         index = np.clip(np.searchsorted(along, wanted, side="right") - 1, 0, here.size - 1)
         target = begin[index] + np.sign(end - begin)[index] * (wanted - along[index])
         first, last = phase[here[index]], phase[here[index] + 1]
-        places += zip(
+        positions += zip(
             here[index].tolist(), ((target - first) / (last - first)).tolist(), strict=True
         )
-    return places
+    return positions
 
 
-def on_the_way(values: np.ndarray, point: int, fraction: float) -> np.ndarray:
-    """Linear interpolation between a point of a curve and the next."""
+def interpolated(values: np.ndarray, point: int, fraction: float) -> np.ndarray:
+    """Linear interpolation between a point of a curve and the next one."""
     return values[point] + fraction * (values[point + 1] - values[point])
 
 
 def states_near(
     model: Structure, rows: Sequence[tuple[int, float, float, np.ndarray, float]]
 ) -> VisitedStates:
-    """The motions near given ones that have exactly their phases of the mode of interest.
+    """The motions near given ones with exactly the requested phase of the mode of interest.
 
-    Arguments: `rows` in the order of the test, which takes the time from 0 to 1: level, force (N),
-    frequency (rad/s), coefficients (kg^1/2 m) and the phase (rad) asked for.
-    Solves the harmonic balance for the motion and its frequency. A structure that drifts is looked
-    at in each state's own time. States that are not found are left out.
+    Arguments: `rows` in the order of the test, which lasts from time 0 to 1: level, force (N),
+    frequency (rad/s), coefficients (kg^1/2 m) and the requested phase (rad).
+    Solves the harmonic balance for the motion and its frequency. A drifting structure is evaluated
+    at the time of each state. States that do not converge are left out.
     """
     level, force, frequency, start, phase = (np.array(c) for c in zip(*rows, strict=True))
     order = np.linspace(0.0, 1.0, len(rows))
     columns = (jnp.asarray(padded(part, 64)) for part in (order, force, phase, frequency, start))
     solved = _at_phases(simulated_structure(model), *columns)
     frequency, coefficients, converged = (np.asarray(a)[: len(rows)] for a in solved)
-    found = VisitedStates(level, order, force, frequency, coefficients)
-    # Newton's method may leave for another branch.
-    size, was = (np.linalg.norm(x[:, 1:3], axis=(1, 2)) for x in (coefficients, start))
+    states = VisitedStates(level, order, force, frequency, coefficients)
+    # Newton's method may have converged to another branch.
+    amplitude, was = (np.linalg.norm(x[:, 1:3], axis=(1, 2)) for x in (coefficients, start))
     off = np.exp(1j * (mode_phase(model, coefficients) - phase))
-    return found.only(converged & (np.abs(size / was - 1) < 0.2) & (off.real > 0))
+    return states.only(converged & (np.abs(amplitude / was - 1) < 0.2) & (off.real > 0))
 
 
 @compiled
@@ -125,8 +125,8 @@ def _at_phases(
         line = (
             jnp.zeros_like(guess).at[n + j].set(jnp.cos(phase)).at[2 * n + j].set(-jnp.sin(phase))
         )
-        found = correct(balance.linearised, guess - (line @ guess) * line, line, 1e-10, 30)
-        omega = found.point[-1] * balance.frequency_scale
-        return omega, balance.coefficients(found.point), found.converged
+        end = correct(balance.linearised, guess - (line @ guess) * line, line, 1e-10, 30)
+        omega = end.point[-1] * balance.frequency_scale
+        return omega, balance.coefficients(end.point), end.converged
 
     return jax.lax.map(at_phase, (order, force, phase, frequency, start))

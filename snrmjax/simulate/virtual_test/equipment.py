@@ -1,4 +1,4 @@
-"""Shaker, amplifier and instruments of the virtual laboratory, by their numbers."""
+"""Parameters of shaker, amplifier and instruments of the virtual laboratory."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ class Shaker(NamedTuple):
 
     resistance: float = 3.0  # ohm
     motor_constant: float = 15.0  # N/A, and V s/m
-    mass: float = 0.0  # kg, armature and force cell beyond its sensing element
+    mass: float = 0.0  # kg, armature and the shaker side of the force cell
     damping: float = 0.0  # N s/m
     stiffness: float = 0.0  # N/m, of the armature's suspension
     largest_voltage: float = np.inf  # V, of the amplifier
@@ -23,10 +23,10 @@ class Shaker(NamedTuple):
 
 
 class Instruments(NamedTuple):
-    """What the channels of force and velocity add.
+    """Noise and anti-alias filter of the force and velocity channels.
 
-    An anti-alias filter, a Butterworth low-pass of `filter_order`, works before sampling and
-    on both channels, so that their relative phase stays. Controllers see what is recorded.
+    The anti-alias filter, a Butterworth low-pass of `filter_order`, acts before sampling on both
+    channels, so that their relative phase is preserved. Controllers see the recorded signals.
     """
 
     force_noise: float = 0.0  # N, 1σ of a sample
@@ -36,7 +36,7 @@ class Instruments(NamedTuple):
 
 
 def check_shaker(shaker: Shaker) -> None:
-    """Raise `ValueError` where a shaker's numbers cannot be."""
+    """Raise `ValueError` for impossible parameters of a shaker."""
     limits = min(shaker.largest_voltage, shaker.largest_current)
     if not (shaker.resistance > 0 and limits > 0 and np.min(shaker) >= 0):
         raise ValueError(
@@ -48,7 +48,7 @@ def check_shaker(shaker: Shaker) -> None:
 
 
 def check_instruments(instruments: Instruments, sampling_rate: float) -> None:
-    """Raise `ValueError` where the instruments' numbers cannot be at this rate (Hz)."""
+    """Raise `ValueError` for impossible parameters of the instruments at this rate (Hz)."""
     force, velocity, corner, order = instruments
     if min(force, velocity) < 0:
         raise ValueError(f"the instruments' noise must not be negative, but is {instruments}.")
@@ -62,7 +62,7 @@ def check_instruments(instruments: Instruments, sampling_rate: float) -> None:
 
 
 def filter_sections(instruments: Instruments, rate: float) -> Float[np.ndarray, "section 6"]:
-    """Second-order sections of the anti-alias filter at a rate in Hz; none where there is none."""
+    """Second-order sections of the anti-alias filter at a rate in Hz; empty without a filter."""
     from scipy.signal import butter
 
     if not np.isfinite(instruments.filter_corner_hz):

@@ -1,13 +1,13 @@
-"""A virtual laboratory: structure, shaker, instruments and a sampled controller, in time.
+"""A virtual laboratory: structure, shaker, instruments and a sampled controller, in time domain.
 
-The structure is any model of this package: modes, potential, contacts, friction with its memory.
-An electrodynamic shaker drives it through a stinger, so that the force drops at resonance and
-carries harmonics, as on a real shaker. From one sample of the controller to the next the voltage
-goes from the last command to the new one (a delay of one sample) on the cubic through the last four
-commands, as smooth as a reconstruction filter leaves it: straight lines, or steps, would have
-images about the sampling rate, which alias into the sampled force. The equations of motion are
-integrated by the classical method of Runge and Kutta, of order 4, in substeps of equal length;
-sliders are moved exactly after each of them.
+The structure is any model of this package: modes, potential, contacts, hysteretic friction. An
+electrodynamic shaker drives it through a stinger, so that the force drops at resonance and
+contains harmonics, as in a real test. Between samples of the controller the voltage follows, with
+a delay of one sample, the cubic through the last four commands, as smooth as after a
+reconstruction filter: linear interpolation or steps would have images about the sampling rate,
+which alias into the sampled force. The equations of motion are integrated by the classical
+Runge-Kutta method of order 4 in substeps of equal length; sliders are updated exactly after each
+of them.
 
 Reference: for the shaker, G. R. Tomlinson, J. Sound Vib. 63 (1979) 337,
 doi:10.1016/0022-460X(79)90681-9.
@@ -41,18 +41,18 @@ from snrmjax.simulate.virtual_test.equipment import (
     filter_sections,
 )
 from snrmjax.simulate.virtual_test.friction_internal_variables import (
-    friction_rows,
+    friction_influence,
     inner_force,
     internal_variables_after_step,
     internal_variables_at_rest,
     scaled_friction,
 )
 
-_FEWEST_STEPS = 20  # a cycle of the fastest linear motion, that the integration can follow it
+_FEWEST_STEPS = 20  # per cycle of the highest linear frequency, for an accurate integration
 
 
 class Sample(NamedTuple):
-    """What the controller sees at a sample."""
+    """The input of the controller at a sample."""
 
     time: Float[Array, ""]
     force: Float[Array, ""]  # N
@@ -60,44 +60,44 @@ class Sample(NamedTuple):
 
 
 class AbstractController(eqx.Module):
-    """A sampled controller: it sees force and velocity and sets the shaker's voltage."""
+    """A sampled controller: force and velocity in, shaker voltage out."""
 
     @abc.abstractmethod
     def initial(self) -> Any:
-        """Its state before the first sample."""
+        """The state before the first sample."""
 
     @abc.abstractmethod
     def step(self, state: Any, sample: Sample, period: Float[Array, ""]) -> tuple[Any, Array, Any]:
-        """The next state, the voltage until the next sample, and what it reports."""
+        """The next state, the voltage until the next sample, and a report."""
 
 
 class TestRecord(NamedTuple):
-    """Channels of a test, one entry a sample."""
+    """Channels of a test, one entry per sample."""
 
     time: Float[Array, " sample"]  # s
     voltage: Float[Array, " sample"]  # V, of the amplifier
     force: Float[Array, " sample"]  # N, as recorded
     velocity: Float[Array, " sample"]  # m/s, as recorded
-    report: Any  # of the controller, arrays that lead with the sample
+    report: Any  # of the controller, arrays with the sample as first axis
 
 
 class LabMotion(NamedTuple):
-    """What the equations of motion integrate."""
+    """State variables of the equations of motion."""
 
     displacement: Float[Array, " mode"]  # kg^1/2 m
     velocity: Float[Array, " mode"]  # kg^1/2 m/s
-    memory: tuple[Float[Array, " state"], ...]  # of friction, one entry an effect
+    internal: tuple[Float[Array, " state"], ...]  # variables of friction, one entry per element
 
 
 class LabState(NamedTuple):
-    """Everything that goes on from one run to the next."""
+    """The state that is passed from one run to the next."""
 
     motion: LabMotion
     controller: Any
     time: Float[Array, ""]
     voltage: Float[Array, "3"]  # of the amplifier at the last three samples, V
-    seen: Float[Array, " channel"]  # force (N) and velocity (m/s) behind the anti-alias filter
-    filtered: Float[Array, "section 2 channel"]  # memory of the anti-alias filter
+    seen: Float[Array, " channel"]  # force (N) and velocity (m/s) after the anti-alias filter
+    filtered: Float[Array, "section 2 channel"]  # state of the anti-alias filter
     largest: Float[Array, ""]  # |q| of the mode of interest so far, kg^1/2 m
 
 
@@ -105,15 +105,15 @@ class Laboratory(eqx.Module):
     """A structure on a shaker with its instruments.
 
     `sampling_rate` in Hz is that of the controller and of the records; each sample is integrated
-    in `substeps`, of which the fastest linear motion (a contact that is closed included) needs 20 a
-    cycle. Effects with memory (friction) need `largest_displacement`, in m at
-    the reference sensor: their sliders, and the width of a smoothed Coulomb force, are set for
-    motions up to it. With `attached` False the shaker is away and nothing drives the structure.
-    `Shaker(1e-6, 1e-6)` is a source of force without dynamics, one newton a volt.
-    What is left of the voltage's images aliases into the force by about (ω period)⁴/38 of the
-    shaker's own force, which near resonance may be several times the force on the structure.
-    Raises `ValueError` for numbers that cannot be, a rate too low, and effects of the measurement
-    or of the force's spectrum, which the shaker and the instruments here have themselves.
+    in `substeps`, of which a cycle of the highest linear frequency (with closed contacts) needs 20.
+    Friction needs `largest_displacement`, in m at the reference sensor: its sliders, and the width
+    of a smoothed Coulomb force, are scaled for motions up to it. With `attached` False the shaker
+    is disconnected and the structure moves freely. `Shaker(1e-6, 1e-6)` is an ideal force source of
+    one newton per volt. The remaining images of the voltage alias into the force by about
+    (ω period)⁴/38 of the shaker's own force, which near resonance may be several times the force
+    on the structure.
+    Raises `ValueError` for impossible parameters, a rate too low, and effects of the measurement
+    or of the force's spectrum, which shaker and instruments produce here.
     """
 
     structure: Structure
@@ -168,17 +168,17 @@ class Laboratory(eqx.Module):
         return modes.damping_ratio.item(modes.mode_of_interest) * self.frequency
 
     def samples(self, cycles: float) -> int:
-        """How many samples so many cycles of the mode of interest have."""
+        """Number of samples in so many cycles of the mode of interest."""
         return round(cycles * self.sampling_rate * 2 * np.pi / self.frequency)
 
     def at_rest(self, controller: AbstractController) -> LabState:
-        """The state before anything moves."""
+        """The state of the structure at rest."""
         model = simulated_structure(self.structure)
         n = model.n_modes
-        memory = internal_variables_at_rest(model, self.friction(), jnp.zeros(n))
+        internal = internal_variables_at_rest(model, self.friction(), jnp.zeros(n))
         sections = len(filter_sections(self.instruments, self.sampling_rate * self.substeps))
         return LabState(
-            LabMotion(jnp.zeros(n), jnp.zeros(n), memory),
+            LabMotion(jnp.zeros(n), jnp.zeros(n), internal),
             controller.initial(),
             jnp.zeros(()),
             jnp.zeros(3),
@@ -194,10 +194,10 @@ class Laboratory(eqx.Module):
         return self.largest_displacement / abs(float(shape))
 
     def friction(self) -> tuple[AbstractHysteresis, ...]:
-        """The effects with a memory, set for motions up to `largest_displacement`."""
+        """The hysteretic elements, scaled for motions up to `largest_displacement`."""
         if not self.structure.hysteretic:
             return ()
-        reach = self.reach() * jnp.sum(jnp.abs(friction_rows(self.structure)), axis=1)
+        reach = self.reach() * jnp.sum(jnp.abs(friction_influence(self.structure)), axis=1)
         return scaled_friction(self.structure, reach, reach * self.frequency / np.sqrt(2))
 
 
@@ -210,11 +210,11 @@ def run_test(
     start: LabState | None = None,
     seed: int = 0,
 ) -> tuple[TestRecord, LabState]:
-    """Let the controller work for a number of samples.
+    """Run the controller for a number of samples.
 
-    Arguments: `start` is where another run ended, by default rest; `seed` draws the noise.
+    Arguments: `start` is the final state of another run, by default rest; `seed` of the noise.
     Returns the record and the state at its end. Deterministic for a seed.
-    Raises `ValueError` where a structure with friction went beyond `largest_displacement`.
+    Raises `ValueError` if a structure with friction exceeded `largest_displacement`.
     Not differentiable: differentiate the steady states of a model by
     `snrmjax.simulate.periodic_motion`.
     """
@@ -245,7 +245,7 @@ def _run(
     structure, ins = simulated_structure(laboratory.structure), laboratory.instruments
     modes, j = structure.modes, structure.modes.mode_of_interest
     shape = modes.mode_shape[reference_sensor(laboratory.structure.modes)]
-    turn = jnp.sign(shape[j] * modes.participation[j])
+    sign = jnp.sign(shape[j] * modes.participation[j])
     period = jnp.asarray(1 / laboratory.sampling_rate)
     steps, limit = laboratory.substeps, laboratory.shaker.largest_voltage
     slope = _equations(laboratory.shaker, laboratory.attached, structure, friction)
@@ -253,7 +253,7 @@ def _run(
     cubic = _between_samples(np.arange(2 * steps + 1) / (2 * steps))
 
     def channels(motion: LabMotion, voltage: Array) -> Array:
-        return jnp.stack([slope(motion, voltage)[1], turn * (shape @ motion.velocity)])
+        return jnp.stack([slope(motion, voltage)[1], sign * (shape @ motion.velocity)])
 
     def sample(state: LabState, drawn: Array) -> tuple[LabState, tuple]:
         force = state.seen[0] + ins.force_noise * drawn[0]
@@ -294,27 +294,27 @@ def _equations(
     structure: Structure,
     friction: tuple[AbstractHysteresis, ...],
 ) -> Callable[[LabMotion, Array], tuple[LabMotion, Array]]:
-    """Rates of a motion under a voltage, and the force that the cell reads."""
+    """Rates of the state under a voltage, and the force at the force cell."""
     terms, drive = structure.linear_terms(), structure.modes.participation
     per_force = drive / terms.mass
     inertia = 1 + shaker.mass * (drive @ per_force)
 
-    def pushed(at: Array, speed: Array, voltage: Array) -> Array:
-        """What the armature gets from its coil and its suspension."""
+    def armature_force(at: Array, speed: Array, voltage: Array) -> Array:
+        """Force of coil and suspension on the armature."""
         current = (voltage - shaker.motor_constant * speed) / shaker.resistance
         current = jnp.clip(current, -shaker.largest_current, shaker.largest_current)
         return shaker.motor_constant * current - shaker.damping * speed - shaker.stiffness * at
 
     def slope(motion: LabMotion, voltage: Array) -> tuple[LabMotion, Array]:
         q, v = motion.displacement, motion.velocity
-        inner, memory = inner_force(structure, friction, q, v, motion.memory)
+        inner, internal = inner_force(structure, friction, q, v, motion.internal)
         free = -inner / terms.mass
         force = jnp.zeros(())
         if attached:
             # The armature's inertia is part of the force: F = push − m (Γ·q̈), q̈ = free + Γ F.
-            push = pushed(drive @ q, drive @ v, voltage)
+            push = armature_force(drive @ q, drive @ v, voltage)
             force = (push - shaker.mass * (drive @ free)) / inertia
-        return LabMotion(v, free + per_force * force, memory), force
+        return LabMotion(v, free + per_force * force, internal), force
 
     return slope
 
@@ -325,7 +325,7 @@ def _integrator(
     friction: tuple[AbstractHysteresis, ...],
     h: Array,
 ) -> Callable[[LabMotion, Float[Array, "3"]], LabMotion]:
-    """One step of length h by the classical method of Runge and Kutta, sliders moved after it."""
+    """One classical Runge-Kutta step of length h, with the sliders updated after it."""
 
     def step(motion: LabMotion, volts: Float[Array, "3"]) -> LabMotion:
         first, middle, last = volts
@@ -340,14 +340,14 @@ def _integrator(
         mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, one, two, three, four)
         moved = after(h, mean)
         begin, end = ((at.displacement, at.velocity) for at in (motion, moved))
-        memory = internal_variables_after_step(structure, friction, moved.memory, begin, end, h)
-        return moved._replace(memory=memory)
+        internal = internal_variables_after_step(structure, friction, moved.internal, begin, end, h)
+        return moved._replace(internal=internal)
 
     return step
 
 
 def _between_samples(fraction: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4"]:
-    """Weights of the last four commands, by Lagrange, at shares of the way between the last two."""
+    """Lagrange weights of the last four commands at fractions of the interval of the last two."""
     at = np.arange(-2.0, 2.0)
     others = [np.delete(at, k) for k in range(4)]
     return np.stack(
@@ -361,20 +361,20 @@ def _between_samples(fraction: Float[np.ndarray, " time"]) -> Float[np.ndarray, 
 
 def _filtered(
     sections: Float[np.ndarray, "section 6"],
-    memory: Float[Array, "section 2 channel"],
+    state: Float[Array, "section 2 channel"],
     value: Float[Array, " channel"],
 ) -> tuple[Float[Array, " channel"], Float[Array, "section 2 channel"]]:
-    """One sample through the sections, direct form II transposed."""
+    """Filter one sample through the sections, direct form II transposed."""
     kept = []
     for k, (b0, b1, b2, _, a1, a2) in enumerate(sections):
-        out = b0 * value + memory[k, 0]
-        kept.append(jnp.stack([b1 * value - a1 * out + memory[k, 1], b2 * value - a2 * out]))
+        out = b0 * value + state[k, 0]
+        kept.append(jnp.stack([b1 * value - a1 * out + state[k, 1], b2 * value - a2 * out]))
         value = out
     return value, jnp.stack(kept)
 
 
 def _fastest(structure: Structure, shaker: Shaker) -> float:
-    """Largest |eigenvalue| (rad/s) of structure and shaker, closed contacts included."""
+    """Largest |eigenvalue| (rad/s) of structure and shaker with closed contacts."""
     model = simulated_structure(structure)
     n, terms = model.n_modes, model.linear_terms()
     mass, stiffness = np.diag(np.asarray(terms.mass)), np.diag(np.asarray(terms.stiffness))
@@ -382,13 +382,13 @@ def _fastest(structure: Structure, shaker: Shaker) -> float:
     grid = np.logspace(-12, 3, 301)
     x = jnp.asarray(np.concatenate([-grid, grid]))
     for effect in model.forces:
-        rows = np.asarray(elements_of([effect], model.modes).rows)
+        influence = np.asarray(elements_of([effect], model.modes).influence)
         if isinstance(effect, AbstractNonsmooth):
             slope = jax.vmap(jax.grad(effect.force))(x, jnp.zeros_like(x))
-            stiffness = stiffness + float(jnp.max(slope)) * np.outer(rows[0], rows[0])
+            stiffness = stiffness + float(jnp.max(slope)) * np.outer(influence[0], influence[0])
         elif isinstance(effect, AbstractHysteresis):
             most = np.asarray(effect.stuck_stiffness())
-            stiffness = stiffness + rows.T @ (most[:, None] * rows)
+            stiffness = stiffness + influence.T @ (most[:, None] * influence)
     drive = np.asarray(model.modes.participation)
     coil = shaker.damping + shaker.motor_constant**2 / shaker.resistance
     coupling = np.outer(drive, drive)

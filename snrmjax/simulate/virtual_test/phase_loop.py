@@ -1,10 +1,10 @@
-"""Phase-locked loop: a controller that holds phase resonance while the drive is raised.
+"""Phase-locked loop: a controller that keeps phase resonance while the drive is raised.
 
-Adaptive filters follow the Fourier coefficients of force and velocity; the phase between their
-fundamentals, zero at resonance, goes through a proportional-integral law to the frequency of the
-drive. Near resonance the phase obeys φ̇ = (ω̃ − Ω) − ζ̃ω̃ φ, so that Ω = Ω₀ + k_p φ + k_i ∫φ makes
+Adaptive filters track the Fourier coefficients of force and velocity; the phase between their
+fundamentals, zero at resonance, is the error of a proportional-integral controller of the drive
+frequency. Near resonance the phase obeys φ̇ = (ω̃ − Ω) − ζ̃ω̃ φ, so that Ω = Ω₀ + k_p φ + k_i ∫φ makes
 φ̈ + (ζ̃ω̃ + k_p) φ̇ + k_i φ = 0: both gains follow from one rate λ, k_p = 2λ − ζω and k_i = λ².
-The loop holds branches that an open loop jumps off, since frequency is no longer prescribed.
+The loop stabilises branches that jump in open loop, since frequency is no longer prescribed.
 
 References: S. Peter & R. I. Leine, Mech. Syst. Signal Process. 96 (2017) 139,
 doi:10.1016/j.ymssp.2017.04.011; M. Scheel, S. Peter, R. I. Leine & M. Krack, J. Sound Vib. 435
@@ -30,26 +30,26 @@ from snrmjax.simulate.virtual_test.laboratory import (
 from snrmjax.simulate.virtual_test.record_phasors import (
     HANN,
     PARTS,
+    ControlledMotion,
     FourierState,
-    HeldMotion,
+    empty_filter,
     followed,
     noise_of_sample,
-    nothing_followed,
     through_hann_window,
 )
 
-_ORDERS = np.arange(1, 6)  # harmonics that the filters follow beside the mean
-_FASTEST, _RATES = 20.0, 20000  # of the loop's spectrum, times its fastest rate, and how many
-_LOCKED_PHASE = np.radians(1.0)  # mean error that counts as locked
-_LOCKED_SCATTER = 0.5  # 1σ of the frequency over the record, in half-power half widths ζω
-_NEXT_SEED = 7919  # a prime: noise of one run is not that of another test's
+_ORDERS = np.arange(1, 6)  # harmonics that the filters track, in addition to the mean
+_FASTEST, _RATES = 20.0, 20000  # range of the loop's spectrum over its fastest rate; grid size
+_LOCKED_PHASE = np.radians(1.0)  # largest mean phase error of a locked loop
+_LOCKED_SCATTER = 0.5  # largest 1σ of the frequency over the record, in half-power half widths ζω
+_NEXT_SEED = 7919  # a prime, so that runs of different tests do not share their noise
 
 
 class LoopGains(NamedTuple):
     """Rates of the loop, in multiples of 1/s.
 
-    `filter_rate` is how fast the filters forget and `loop_rate` is λ; a loop is well tuned where
-    λ is several times the decay ζω of the structure and a fifth of the filter's rate or less.
+    `filter_rate` is the decay rate of the filters and `loop_rate` is λ; a loop is well tuned if λ
+    is several times the decay ζω of the structure and at most a fifth of the filter rate.
     """
 
     filter_rate: float
@@ -57,7 +57,7 @@ class LoopGains(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """Angle and integral of the loop, and what its filters know."""
+    """Angle and integral of the loop, and the state of its filters."""
 
     angle: Float[Array, ""]
     integral: Float[Array, ""]  # rad/s
@@ -66,14 +66,14 @@ class LoopState(NamedTuple):
 
 
 class LoopReport(NamedTuple):
-    """What the loop writes down at a sample."""
+    """Record of the loop at a sample."""
 
     frequency: Float[Array, ""]  # rad/s
     angle: Float[Array, ""]  # rad, of the drive at the sample
 
 
 class PhaseLockedLoop(AbstractController):
-    """The controller: a voltage of constant amplitude whose frequency holds the phase."""
+    """The controller: a voltage of constant amplitude whose frequency controls the phase."""
 
     voltage: Float[Array, ""]
     start_frequency: Float[Array, ""]  # rad/s
@@ -83,23 +83,23 @@ class PhaseLockedLoop(AbstractController):
     target: Float[Array, ""]  # rad, phase of the velocity ahead of the force
 
     def initial(self) -> LoopState:
-        """At the start frequency, with nothing followed."""
+        """At the start frequency, with empty filters."""
         zero = jnp.zeros(())
-        return LoopState(zero, zero, nothing_followed(2, _ORDERS), self.start_frequency)
+        return LoopState(zero, zero, empty_filter(2, _ORDERS), self.start_frequency)
 
     def step(
         self, state: LoopState, sample: Sample, period: Float[Array, ""]
     ) -> tuple[LoopState, Array, LoopReport]:
-        """The frequency by the phase that is left, and the voltage there."""
+        """Frequency from the phase error, and the voltage."""
         seen = jnp.stack([sample.force, sample.velocity])
         filters = followed(state.filters, seen, state.angle, _ORDERS, self.filter_rate * period)
         ratio = filters.harmonics[1, 0] * jnp.conj(filters.harmonics[0, 0])
-        turned = ratio * jnp.exp(-1j * self.target)
-        phase = jnp.where(jnp.abs(ratio) > 0, jnp.angle(turned), 0.0)
+        error = ratio * jnp.exp(-1j * self.target)
+        phase = jnp.where(jnp.abs(ratio) > 0, jnp.angle(error), 0.0)
         proportional = 2 * self.loop_rate - self.decay
         integral = state.integral + self.loop_rate**2 * phase * period
         frequency = self.start_frequency + proportional * phase + integral
-        # A frequency off by more than half of it means that the loop is lost.
+        # A frequency beyond these limits means that the loop has lost lock.
         frequency = jnp.clip(frequency, 0.5 * self.start_frequency, 2.0 * self.start_frequency)
         angle = jnp.mod(state.angle + frequency * period, 2 * jnp.pi)
         report = LoopReport(frequency, state.angle)
@@ -108,9 +108,9 @@ class PhaseLockedLoop(AbstractController):
 
 
 class PhaseSweep(NamedTuple):
-    """States of one drive voltage at held phases; NaN where a phase was not held."""
+    """States of one drive voltage at controlled phases; NaN where the loop did not lock."""
 
-    phase: Float[np.ndarray, " state"]  # rad, asked for: velocity ahead of force
+    phase: Float[np.ndarray, " state"]  # rad, requested: velocity ahead of force
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N
     velocity: Complex[np.ndarray, " state"]  # m/s, relative to the force
@@ -129,10 +129,10 @@ def phase_sweep(
     record_cycles: int = 50,
     seed: int = 0,
 ) -> PhaseSweep:
-    """A whole response at one drive voltage, its unstable part included, phase by phase.
+    """A whole response at one drive voltage, phase by phase, its unstable part included.
 
-    On the response of one mode the phase falls steadily along the curve, around its folds too, so
-    that a loop that holds one phase after another meets no jump.
+    On the response of one mode the phase decreases monotonically along the curve, around its folds
+    too, so that a loop stepped from phase to phase meets no jump.
 
     Arguments: `voltage` in V; `phases` in rad in the order of the test, positive below resonance;
     the others as in `locked_motions`. Returns a `PhaseSweep`.
@@ -169,17 +169,17 @@ def locked_motions(
     settle_cycles: int = 300,
     record_cycles: int = 50,
     seed: int = 0,
-) -> tuple[list[HeldMotion], LabState | None, float]:
-    """The loop stays closed while drive voltage and phase step on.
+) -> tuple[list[ControlledMotion], LabState | None, float]:
+    """Step drive voltage and phase in closed loop and record the motions.
 
-    At each step it has `settle_cycles` of the linear mode to lock, then `record_cycles` are
-    recorded. Fundamentals of force and velocity come from the record itself, by projection on the
-    drive's angle.
+    At each step the loop has `settle_cycles` of the linear mode to lock, then `record_cycles` are
+    recorded. Fundamentals of force and velocity are computed from the record, by projection on the
+    angle of the drive.
 
     Arguments: `steps` as voltage (V) and phase (rad, of the velocity ahead of the force) in the
     order of the test; `gains` by default a filter of ω/20 of the mode of interest and a loop of a
     sixth of that.
-    Returns the motions, the state of the laboratory after them, and how long it took in s.
+    Returns the motions, the final state of the laboratory, and the duration in s.
     Raises `ValueError` for voltages or cycles that are not positive.
     """
     positive("voltages", [voltage for voltage, _ in steps])
@@ -214,40 +214,40 @@ def locked_motions(
 
 
 class _Locked(NamedTuple):
-    """The end of a record: frequency, and force and velocity turned against the drive."""
+    """The recorded part: frequency, and force and velocity demodulated by the drive's angle."""
 
     frequency: np.ndarray  # rad/s
     force: np.ndarray  # N, complex
     velocity: np.ndarray  # m/s, complex
     decay: float  # ζω of the linear mode, 1/s
-    phase: float  # rad, asked for
+    phase: float  # rad, requested
     noise: Float[np.ndarray, "2"]  # of a sample of force (N) and velocity (m/s)
     period: float  # s, of sampling
     gains: LoopGains
 
-    def motion(self) -> HeldMotion:
-        """Means over the record, and 1σ from its noise and the scatter between its tenths."""
+    def motion(self) -> ControlledMotion:
+        """Means over the record, with 1σ from its noise and the scatter between its tenths."""
         omega, force, velocity = (float(np.mean(self.frequency)), *map(np.mean, self[1:3]))
         ratio = force / velocity  # N s/m
         off = np.angle(np.exp(-1j * self.phase) / ratio) if np.isfinite(ratio) else np.inf
         steady = float(np.std(self.frequency)) < _LOCKED_SCATTER * self.decay
         if not (abs(off) <= _LOCKED_PHASE and steady):
-            return HeldMotion(False, omega)
+            return ControlledMotion(False, omega)
         parts = np.array_split(np.arange(len(self.frequency)), PARTS)
         inner = parts[1:-1]
         each = [np.mean(self.force[k]) / np.mean(self.velocity[k]) for k in inner]
         spread = np.std([np.mean(self.frequency[k]) for k in parts])
-        turn = self.decay * np.std(np.angle(each))
-        # Variances of ln F and ln v, or of their phases, over a stretch, times its length.
+        from_phase = self.decay * np.std(np.angle(each))
+        # Variances of ln F and ln v, or of their phases, over a record, times its duration.
         densities = 2 * self.period * (self.noise / np.abs([force, velocity])) ** 2
         density, seconds = float(np.sum(densities)), len(self.frequency) * self.period
         scatter = float(np.std(np.real(each))) / np.sqrt(len(inner) - 1) / float(np.real(ratio))
-        return HeldMotion(
+        return ControlledMotion(
             True,
             omega,
             max(
-                float(np.hypot(spread, turn) / np.sqrt(PARTS - 1)),
-                np.sqrt(density) * _carried(self.gains, self.decay, seconds),
+                float(np.hypot(spread, from_phase) / np.sqrt(PARTS - 1)),
+                np.sqrt(density) * _propagated(self.gains, self.decay, seconds),
             ),
             *(complex(force), complex(velocity)),
             max(scatter, float(np.sqrt(HANN * density / seconds))),
@@ -255,18 +255,18 @@ class _Locked(NamedTuple):
         )
 
 
-def _carried(gains: LoopGains, decay: float, seconds: float) -> float:
-    """1σ of the frequency's mean over a record for white noise of the phase of density one.
+def _propagated(gains: LoopGains, decay: float, seconds: float) -> float:
+    """1σ of the mean frequency of a record for white phase noise of unit density.
 
-    The loop brings the measured phase to zero, and noise with it: from noise to frequency
-    G = C D/(1 + C D P), with the law C = k_p + k_i/s, the filter D and the structure
-    P = 1/(s + ζω). Neighbouring parts of a record share what a loop as slow as they does.
+    The loop controls the measured phase, noise included: the transfer function from noise to
+    frequency is G = C D/(1 + C D P), with the controller C = k_p + k_i/s, the filter D and the
+    structure P = 1/(s + ζω). A slow loop correlates neighbouring parts of a record.
     """
     fast = max(*gains, 1 / seconds)
     rate = np.linspace(0.0, _FASTEST * fast, _RATES)[1:]
     s = 1j * rate
-    law = (2 * gains.loop_rate - decay) + gains.loop_rate**2 / s
-    seen = law * gains.filter_rate / (s + gains.filter_rate)
+    controller = (2 * gains.loop_rate - decay) + gains.loop_rate**2 / s
+    seen = controller * gains.filter_rate / (s + gains.filter_rate)
     power = np.abs(seen / (1 + seen / (s + decay))) ** 2
     mean = np.sinc(rate * seconds / (2 * np.pi)) ** 2
     return float(np.sqrt(np.sum(power * mean) * (rate[1] - rate[0]) / np.pi))

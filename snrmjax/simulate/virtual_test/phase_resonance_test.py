@@ -17,8 +17,8 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.appropriation import (
     around,
+    interpolated,
     mode_phase,
-    on_the_way,
     phase_limits,
     spread_in_phase,
     states_near,
@@ -33,18 +33,18 @@ from snrmjax.simulate.virtual_test.recording import (
 
 
 class VirtualTest(AbstractResult):
-    """What a virtual test recorded."""
+    """Record of a virtual test."""
 
     coordinates: ClassVar[tuple[str, ...]] = SteadyStates.coordinates
 
     steady_states: SteadyStates
     jumps: tuple[tuple[int, float], ...]  # (level, frequency in rad/s) where a branch ended
     curves: tuple[ResponseCurve, ...]  # the exact responses behind the test
-    # States aimed at that the test did not reach, or that were not found.
+    # Planned states that the test did not reach or that did not converge.
     n_missing: int = setting(default=0)
 
     def variables(self) -> Mapping[str, Variable]:
-        """The steady states, by the names of their file's columns."""
+        """The steady states, under the column names of their file."""
         return self.steady_states.variables()
 
 
@@ -64,21 +64,20 @@ def phase_resonance_test(
 
     At every level the frequency is stepped along the stable response, from both ends of the
     range; states whose appropriation indicator (Eq. 20, of the fundamental) lies inside
-    `appropriation` are recorded, `points_per_level` of them, evenly spread in phase over what a
-    test can reach of both sides. Where a stable branch ends, the test jumps to the next one,
-    which is noted in `jumps`, and records along that one both ways; states between the two are not
-    reached.
+    `appropriation` are recorded, `points_per_level` of them, evenly spread in phase over the
+    reachable part of both sides. Where a stable branch ends, the test jumps to the next one, noted
+    in `jumps`, and records along that one in both directions; states in between are not reached.
 
-    By harmonic balance it steps infinitely slowly and records exact states, at `order` from 0
-    to 1 in the order of the rows, through the measurement effects of the model; drift makes its
-    way through the test. For transients see `stepped_sine_test` in a `Laboratory`.
+    By harmonic balance it records exact steady states, at `order` from 0 to 1 in the order of the
+    rows, through the measurement effects of the model; drift proceeds through the test. For
+    transients see `stepped_sine_test` in a `Laboratory`.
 
     Arguments: `forces` in N, frequencies in rad/s; `recording` has the random errors and the
-    harmonics recorded beside the fundamental; `harmonic_order` the highest of the motion.
-    Returns a `VirtualTest`; its steady states carry the stated standard deviations, and
-    `n_missing` counts states aimed at that could not be computed.
-    Raises `ValueError` for an empty range of the indicator, for one that no stable state falls
-    into, and for harmonics, errors or steps that make no sense.
+    harmonics recorded in addition to the fundamental; `harmonic_order` of the motion.
+    Returns a `VirtualTest`; its steady states have the stated standard deviations, and
+    `n_missing` counts planned states that could not be computed.
+    Raises `ValueError` for an empty range of the indicator or one without stable states, and for
+    invalid harmonics, errors or numbers of points.
     Not differentiable: differentiate the steady states of a model by
     `snrmjax.simulate.periodic_motion`.
     Reference: Kwarta & Allen, sections 1.2 and 3.1.
@@ -89,18 +88,18 @@ def phase_resonance_test(
     check_recording(recording, harmonic_order)
     loads = positive("forces", forces).tolist()
     low, high = frequency_range(from_frequency, to_frequency).tolist()
-    found = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)
-    if not len(found.states.level):
+    visited = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)
+    if not len(visited.states.level):
         raise ValueError(
             "no stable state has an appropriation indicator in the range asked for; widen "
             "`appropriation` or the frequency range."
         )
-    recorded = recorded_states(model, found.states, recording)
-    return VirtualTest(recorded, tuple(found.jumps), found.curves, found.n_missing)
+    recorded = recorded_states(model, visited.states, recording)
+    return VirtualTest(recorded, tuple(visited.jumps), visited.curves, visited.n_missing)
 
 
 class _Visited(NamedTuple):
-    """States that a test visits, its jumps, the exact curves and how many states it missed."""
+    """States that a test visits, its jumps, the exact curves and the number of missing states."""
 
     states: VisitedStates
     jumps: list[tuple[int, float]]
@@ -117,7 +116,7 @@ def _along_curves(
     harmonic_order: int,
 ) -> _Visited:
     """States along the stable parts of the exact curves."""
-    # A drifting structure as it is in the middle of each level.
+    # A drifting structure at the middle of each level.
     middles = (np.arange(len(forces)) + 0.5) / max(len(forces), 1)
     models = [dataclasses.replace(model, test_order=jnp.asarray(middle)) for middle in middles]
     settings = ResponseSettings(harmonic_order=harmonic_order)
@@ -131,9 +130,9 @@ def _along_curves(
             jumps += [(level, f) for f in left]
             phase = mode_phase(model, curve.coefficients)
             near = reached & _around_resonance(curve, phase, limits[1])
-            for place in spread_in_phase(phase, near, *limits, points_per_level):
+            for position in spread_in_phase(phase, near, *limits, points_per_level):
                 columns = (curve.frequency, curve.coefficients, phase)
-                at = (on_the_way(column, *place) for column in columns)
+                at = (interpolated(column, *position) for column in columns)
                 rows.append((level, curve.force, *at))
     curves = tuple(curve for parts in batch.curves for curve in parts)
     if not rows:
@@ -144,7 +143,7 @@ def _along_curves(
 
 
 def _around_resonance(curve: ResponseCurve, phase: np.ndarray, largest: float) -> np.ndarray:
-    """Points around the strongest phase resonance; without one every point counts."""
+    """Points around the strongest phase resonance; without one all points."""
     resonances = curve.at_events("phase_resonance")
     if not resonances.size:
         return np.ones(len(phase), dtype=bool)
@@ -153,16 +152,16 @@ def _around_resonance(curve: ResponseCurve, phase: np.ndarray, largest: float) -
 
 
 def _swept(curve: ResponseCurve) -> tuple[np.ndarray, list[float]]:
-    """Points that stepping the frequency up and down visits, and where it jumps.
+    """Points that frequency steps up and down visit, and the frequencies of jumps.
 
-    A sweep stays on a stable branch until it ends, then goes on with the next stable points of
-    the same curve at that frequency or, beyond a window of period doubling, the next frequency.
-    From where it lands it is also turned round: a resonance can lie behind it.
+    A sweep stays on a stable branch to its end, then continues with the next stable points of the
+    same curve at that frequency or, beyond a window of period doubling, the next frequency. From
+    where it lands it also sweeps back, since a resonance can lie in that direction.
     """
     n = len(curve.frequency)
     visited = np.zeros(n, dtype=bool)
     stays = curve.is_stable.copy()
-    stays[curve.at_events("fold")] = False  # there a multiplier is 1, give or take a rounding
+    stays[curve.at_events("fold")] = False  # a multiplier is 1 to rounding there
     jumps: list[float] = []
     for direction in (1, -1):
         order = np.arange(n)[::direction]

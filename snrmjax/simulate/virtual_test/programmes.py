@@ -1,4 +1,4 @@
-"""Programmes of a test: stepped sines, multisines, decays and tables of voltages, in time."""
+"""Test programmes in time domain: stepped sines, multisines, decays, tables of voltages."""
 
 import dataclasses
 from typing import NamedTuple
@@ -22,19 +22,19 @@ from snrmjax.simulate.virtual_test.laboratory import (
     run_test,
 )
 from snrmjax.simulate.virtual_test.phase_loop import LoopGains, locked_motions
-from snrmjax.simulate.virtual_test.record_phasors import HeldMotion
+from snrmjax.simulate.virtual_test.record_phasors import ControlledMotion
 
 
 class TestSteps(NamedTuple):
-    """Where the steady states of a record are."""
+    """Positions of the steady states in a record."""
 
     frequency: Float[np.ndarray, " step"]  # rad/s
-    first: Int[np.ndarray, " step"]  # sample at which the settled part begins
+    first: Int[np.ndarray, " step"]  # first sample of the settled part
     samples: int  # of the settled part
 
 
 class LaboratoryTest(NamedTuple):
-    """A test in the virtual laboratory: its channels and how long it took."""
+    """A test in the virtual laboratory: its channels and its duration."""
 
     record: TestRecord
     seconds: float
@@ -42,15 +42,15 @@ class LaboratoryTest(NamedTuple):
 
 
 class DecayTest(NamedTuple):
-    """A free decay from a resonance that a loop held, and that resonance."""
+    """A free decay from a controlled resonance, and that resonance."""
 
-    record: TestRecord  # from the moment on at which the shaker is away
-    seconds: float  # resonance and decay
-    resonance: HeldMotion  # `held` where the loop had locked
+    record: TestRecord  # from the moment the shaker is disconnected
+    seconds: float  # duration of resonance and decay
+    resonance: ControlledMotion  # `held` if the loop had locked
 
 
 class Playback(AbstractController):
-    """A table of voltages, one a sample; zero after its end."""
+    """A table of voltages, one per sample; zero after its end."""
 
     voltages: Float[Array, " sample"]
 
@@ -67,18 +67,18 @@ class Playback(AbstractController):
 
 
 class StepState(NamedTuple):
-    """Where a stepped sine is."""
+    """State of a stepped sine."""
 
     samples: Int[Array, ""]  # so far
     angle: Float[Array, ""]
 
 
 class SteppedSineDrive(AbstractController):
-    """A sine of one voltage whose frequency steps while its phase goes on."""
+    """A sine of constant voltage and continuous phase whose frequency is stepped."""
 
     frequencies: Float[Array, " step"]  # rad/s
     voltage: Float[Array, ""]
-    dwell: Int[Array, ""]  # samples a step
+    dwell: Int[Array, ""]  # samples per step
 
     def initial(self) -> StepState:
         """Before the first step."""
@@ -103,9 +103,9 @@ def stepped_sine_test(
     record_cycles: int = 30,
     seed: int = 0,
 ) -> LaboratoryTest:
-    """Step the frequency of a sine without ever stopping the motion, in open loop.
+    """Step the frequency of a sine in open loop, with continuous phase.
 
-    Force and response find themselves, and jump where a branch ends.
+    Force and response are not controlled, and jump where a branch ends.
 
     Arguments: `voltage` in V; `frequencies` in rad/s in the order of the test; cycles of the linear
     mode of interest at each of them, to settle and then to record.
@@ -140,9 +140,9 @@ def multisine_test(
     *,
     seed: int = 0,
 ) -> LaboratoryTest:
-    """A periodic multisine of equal lines.
+    """A periodic multisine with lines of equal amplitude.
 
-    Arguments: `rms_voltage` in V of the whole; `lines` are multiples of the sampling rate over
+    Arguments: `rms_voltage` in V of the signal; `lines` are multiples of the sampling rate over
     `period_samples`; phases are drawn from `seed`.
     Returns a `LaboratoryTest` of `periods` periods, the first of them with the transient.
     Raises `ValueError` for lines outside 1 to half of `period_samples`, and for numbers that are
@@ -181,7 +181,7 @@ def decay_test(
     record_cycles: int = 50,
     seed: int = 0,
 ) -> DecayTest:
-    """Hold phase resonance by a loop, take the shaker away and record the decay.
+    """Lock onto phase resonance, disconnect the shaker and record the decay.
 
     Arguments: `voltage` in V of the resonance; `decay_seconds` after it; the others as in
     `locked_motions`. Returns a `DecayTest`, whose velocity goes into `resonant_decay`.
@@ -198,8 +198,8 @@ def decay_test(
         seed=seed,
     )
     free = Playback(jnp.zeros(1))
-    held = state or laboratory.at_rest(free)
-    start = held._replace(controller=free.initial(), voltage=jnp.zeros(3))
+    locked = state or laboratory.at_rest(free)
+    start = locked._replace(controller=free.initial(), voltage=jnp.zeros(3))
     count = round(decay_seconds * laboratory.sampling_rate)
     away = dataclasses.replace(laboratory, attached=False)
     record, _ = run_test(away, free, count, start=start, seed=seed + 1)
@@ -214,11 +214,11 @@ def steady_states_of(
     level: int = 1,
     harmonic_order: tuple[int, ...] = (1, 2, 3),
 ) -> SteadyStates:
-    """The steady states of a stepped sine, from the part of every step that was kept.
+    """The steady states of a stepped sine, from the settled part of every step.
 
     Arguments: `level` that they all belong to; `harmonic_order` as in `stepped_sine_states`.
-    Returns `SteadyStates` of the reference sensor, one a step, with standard deviations: a step
-    that has not settled, or on which the motion jumps, has a large one.
+    Returns `SteadyStates` of the reference sensor, one per step, with standard deviations: large
+    ones for a step that has not settled or in which the motion jumps.
     Raises `ValueError` for a test without steps, and for a step that cannot be fitted.
     Not differentiable: differentiate the steady states of a model by
     `snrmjax.simulate.periodic_motion`.
@@ -227,16 +227,16 @@ def steady_states_of(
         raise ValueError("`test` must be a stepped sine: other records have no steady states.")
     modes = laboratory.structure.modes
     sensor, j = reference_sensor(modes), modes.mode_of_interest
-    # Records have the sign in which force and velocity agree; states have the model's.
-    turn = float(np.sign(modes.mode_shape[sensor, j] * modes.participation[j]))
+    # In records force and velocity agree in sign at resonance; states have the model's.
+    sign = float(np.sign(modes.mode_shape[sensor, j] * modes.participation[j]))
     record, rate = test.record, laboratory.sampling_rate
     recording = time_recording(
-        np.stack([record.force, turn * record.velocity, record.voltage]),
+        np.stack([record.force, sign * record.velocity, record.voltage]),
         [Channel("force", "force"), Channel("velocity", "velocity"), Channel("drive", "voltage")],
         rate,
     )
     first, dwell = test.steps.first / rate, test.steps.samples / rate
-    found = stepped_sine_states(
+    fitted = stepped_sine_states(
         *(recording, "force", ["velocity"]),
         harmonic_order=harmonic_order,
         level=level,
@@ -246,7 +246,7 @@ def steady_states_of(
         settle=0.0,
         tolerance=np.inf,
     )
-    if found.states.n_states < len(first):
-        reasons = ", ".join(f"{count} {reason}" for reason, count in found.counts.reasons)
+    if fitted.states.n_states < len(first):
+        reasons = ", ".join(f"{count} {reason}" for reason, count in fitted.counts.reasons)
         raise ValueError(f"not every step of `test` can be fitted: {reasons}.")
-    return found.states
+    return fitted.states

@@ -1,7 +1,7 @@
-"""Phasors of a record: followed sample by sample by a controller, or read from a whole stretch.
+"""Phasors of a record: tracked sample by sample by a controller, or fitted to a whole record.
 
-The filter moves the Fourier coefficients at each sample along the gradient of the squared error of
-the series (least mean squares): a band-pass of half width `rate` about every harmonic.
+The filter updates the Fourier coefficients at each sample along the gradient of the squared error
+of the series (least mean squares): a band-pass of half width `rate` about every harmonic.
 
 Reference: B. Widrow & S. D. Stearns, Adaptive Signal Processing (1985), chapter 12.
 """
@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-HANN = 1.5  # noise bandwidth of a Hann window, over that of none
+HANN = 1.5  # noise bandwidth of a Hann window over that of a rectangular one
 PARTS = 10  # of a record, for its scatter
-_MOST_HARMONICS = 9  # that a record may have beside its noise
+_MOST_HARMONICS = 9  # removed from a record to estimate its noise
 
 
-class HeldMotion(NamedTuple):
-    """What a controller held, of the end of a record: fundamentals and their errors, 1σ.
+class ControlledMotion(NamedTuple):
+    """A motion under control: fundamentals over the recorded part and their errors, 1σ.
 
-    NaN where there is nothing to read; without `held` the target was missed, or not held steadily.
+    NaN if not available; without `held` the target was missed or the motion was not steady.
     """
 
     held: bool
@@ -28,19 +28,19 @@ class HeldMotion(NamedTuple):
     frequency_std: float = np.nan  # rad/s; NaN where the frequency is prescribed
     force: complex = complex(np.nan)  # N
     velocity: complex = complex(np.nan)  # m/s
-    ratio_std: float = np.nan  # of force over velocity, relative: of either part
+    ratio_std: float = np.nan  # of force over velocity, relative: of real and imaginary part each
     velocity_std: float = np.nan  # relative
     invasive: float = np.nan  # higher harmonics of the voltage over its fundamental
 
 
 class FourierState(NamedTuple):
-    """What the filters know: complex amplitudes (peak) and means."""
+    """State of the filters: complex amplitudes (peak) and means."""
 
     harmonics: Complex[Array, "channel order"]
     means: Float[Array, " channel"]
 
 
-def nothing_followed(channels: int, orders: Int[np.ndarray, " order"]) -> FourierState:
+def empty_filter(channels: int, orders: Int[np.ndarray, " order"]) -> FourierState:
     """The state before the first sample."""
     return FourierState(jnp.zeros((channels, len(orders)), dtype=complex), jnp.zeros(channels))
 
@@ -55,7 +55,7 @@ def followed(
     """The state after one sample of each channel.
 
     Arguments: `angle` of the fundamental in rad; `fraction` is the filter's rate times the sampling
-    period: what a coefficient forgets in a sample.
+    period, by which the error of a coefficient decays per sample.
     """
     basis = jnp.exp(1j * orders * angle)
     error = seen - state.means - jnp.real(state.harmonics @ basis)
@@ -68,9 +68,9 @@ def followed(
 def through_hann_window(
     signal: Float[np.ndarray, " sample"], angle: Float[np.ndarray, "*order sample"]
 ) -> Complex[np.ndarray, "*order sample"]:
-    """A signal turned back by an angle, whose mean is the amplitude there.
+    """A signal demodulated by an angle, through a Hann window; its mean is the amplitude.
 
-    A record need not hold whole cycles.
+    A record need not contain whole cycles.
     """
     window = np.hanning(len(signal))
     return signal * (2 * np.exp(-1j * angle) * (window / window.mean()))
@@ -79,7 +79,7 @@ def through_hann_window(
 def noise_of_sample(
     signal: Float[np.ndarray, " sample"], angle: Float[np.ndarray, " sample"]
 ) -> float:
-    """1σ of a sample: what the mean and the harmonics of the drive leave of a record."""
+    """1σ of a sample: the residual of a record without its mean and harmonics of the drive."""
     design, solved = _series(signal, angle)
     return float(np.std(signal - design @ solved))
 
@@ -89,7 +89,7 @@ def scatter_of_ratio(
     velocity: Float[np.ndarray, " sample"],
     angle: Float[np.ndarray, " sample"],
 ) -> float:
-    """1σ of the mean force over velocity, relative: of either part, from the parts of a record."""
+    """Relative 1σ of mean force over velocity, of each component, from parts of a record."""
 
     def fundamental(signal: np.ndarray, angle: np.ndarray) -> complex:
         _, solved = _series(signal, angle)
@@ -104,7 +104,7 @@ def scatter_of_ratio(
 
 
 def _series(signal: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean, cosines and sines of the drive's harmonics, and their amplitudes in the record."""
-    turns = angle[:, None] * np.arange(1, _MOST_HARMONICS + 1)
-    design = np.concatenate([np.ones((len(angle), 1)), np.cos(turns), np.sin(turns)], axis=1)
+    """Mean, cosines and sines of the drive's harmonics, and their fitted amplitudes."""
+    angles = angle[:, None] * np.arange(1, _MOST_HARMONICS + 1)
+    design = np.concatenate([np.ones((len(angle), 1)), np.cos(angles), np.sin(angles)], axis=1)
     return design, np.linalg.lstsq(design, signal, rcond=None)[0]

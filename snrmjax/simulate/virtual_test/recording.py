@@ -1,4 +1,4 @@
-"""What instruments make of the states that a test visits: the measurement chain and its errors."""
+"""The measurement chain of a virtual test: instruments, their effects and random errors."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,17 +17,17 @@ from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_ph
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 
 _BLOCK = 4096
-_POINTS = 256  # of a curve, that instruments record at a time
+_POINTS = 256  # of a curve, in one call
 
 
 class MeasurementErrors(NamedTuple):
-    """Random errors of a test, 1σ; what a level shares is drawn once for each level."""
+    """Random errors of a test, 1σ; those of a level are drawn once per level."""
 
     amplitude: float = 0.0  # relative (0.01 is 1 %), of the velocity
     phase: float = 0.0  # rad
     force: float = 0.0  # relative
-    level_gain: float = 0.0  # relative, shared by a level
-    level_phase: float = 0.0  # rad, shared by a level
+    level_gain: float = 0.0  # relative, common to a level
+    level_phase: float = 0.0  # rad, common to a level
     harmonic: float = 0.0  # m/s, rms of the complex error of every higher harmonic
 
 
@@ -35,21 +35,21 @@ NO_ERRORS = MeasurementErrors()
 
 
 class Recording(NamedTuple):
-    """What a test writes down of the states it visits: random errors, and further harmonics."""
+    """Settings of the recorded states: random errors, and harmonics to record."""
 
     errors: MeasurementErrors = NO_ERRORS
     seed: int = 0  # of the random errors
-    keep_harmonics: tuple[int, ...] = ()  # orders recorded beside the fundamental
+    keep_harmonics: tuple[int, ...] = ()  # orders recorded in addition to the fundamental
 
 
 EXACT = Recording()
 
 
 class VisitedStates(NamedTuple):
-    """The states that a test visits, as they are, in the order of the test."""
+    """The exact states that a test visits, in the order of the test."""
 
     level: Int[np.ndarray, " state"]
-    order: Float[np.ndarray, " state"]  # when in the test, from 0 to 1
+    order: Float[np.ndarray, " state"]  # time in the test, from 0 to 1
     force: Float[np.ndarray, " state"]  # N
     frequency: Float[np.ndarray, " state"]  # rad/s
     coefficients: Float[np.ndarray, "state coefficient mode"]  # kg^1/2 m, all simulated modes
@@ -60,7 +60,7 @@ class VisitedStates(NamedTuple):
 
 
 def check_recording(recording: Recording, harmonic_order: int) -> None:
-    """Raise `ValueError` for harmonics that are not simulated and errors that make no sense."""
+    """Raise `ValueError` for harmonics that are not simulated and for invalid errors."""
     errors, _, keep_harmonics = recording
     if not all(2 <= h <= harmonic_order for h in keep_harmonics):
         raise ValueError(
@@ -77,10 +77,10 @@ def recorded_states(
     states: VisitedStates,
     recording: Recording,
 ) -> SteadyStates:
-    """The states as they are written down, with their place in the test as `order`.
+    """The states as recorded, with their time in the test as `order`.
 
-    What the sensors see (the flexible modes and the rigid-body ones) goes through the model's
-    measurement effects in their order; random errors come last.
+    The motion at the sensors (flexible and rigid-body modes) passes the model's measurement
+    effects in their order; random errors are added last.
     """
     modes = simulated_structure(model).modes
     frequency = jnp.asarray(states.frequency)
@@ -97,9 +97,9 @@ def recorded_states(
 
 
 def recorded_curves(model: Structure, curves: Sequence[ResponseCurve]) -> list[ResponseCurve]:
-    """Simulated responses as the model's instruments record them: another force, other velocities.
+    """Simulated responses as the model's instruments record them, in force and velocities.
 
-    Events stay with the motion's points.
+    Events remain at the points of the exact motion.
     """
     if not model.measurement_effects:
         return list(curves)
@@ -123,8 +123,8 @@ def _recorded(model: Structure, curve: ResponseCurve) -> ResponseCurve:
 def acting_force(model: Structure, recorded: float) -> float:
     """The force (N) that the model's instruments record as `recorded` (N).
 
-    Validity: effects whose recorded force is a straight line of the acting one, the same for every
-    motion, as a gain and an offset are.
+    Validity: the recorded force is a linear function of the acting one, the same for every motion,
+    as with a gain and an offset.
     """
     acting = jnp.array([1.0, 2.0]) * recorded
     still = jnp.zeros((2, 2, len(model.modes.sensors)), dtype=complex)
@@ -136,7 +136,7 @@ def acting_force(model: Structure, recorded: float) -> float:
 def _behind_instruments(
     model: Structure, frequency: Array, force: Array, velocity: Array, displacement: Array
 ) -> tuple[Array, Array]:
-    """Force and velocities as the model's measurement effects, one after the other, leave them."""
+    """Force and velocities after the model's measurement effects, applied in sequence."""
     for effect in model.measurement_effects:
         force, velocity = effect.recorded(frequency, force, velocity, displacement)
     return force, velocity
@@ -161,7 +161,7 @@ def _with_errors(
     modes: LinearModes,
     recording: Recording,
 ) -> SteadyStates:
-    """Measured values: the exact ones with errors drawn from a seeded key."""
+    """Measured values: the exact ones with random errors."""
     errors, seed, keep_harmonics = recording
     sensors, base = modes.sensors, modes.base
     keep_harmonics = tuple(int(h) for h in keep_harmonics)
@@ -176,15 +176,17 @@ def _with_errors(
 
     groups, group = np.unique(states.level, return_inverse=True)
     gain = errors.level_gain * normal(keys[3], len(groups))[group]
-    turn = errors.level_phase * normal(keys[4], len(groups))[group]
-    shared = (1 + gain) * np.exp(1j * turn)
+    phase = errors.level_phase * normal(keys[4], len(groups))[group]
+    shared = (1 + gain) * np.exp(1j * phase)
     alone = (1 + errors.amplitude * normal(keys[0], n, n_sensors)) * np.exp(
         1j * errors.phase * normal(keys[1], n, n_sensors)
     )
     factor = shared[:, None] * alone
-    size = np.abs(factor)  # a phase is an error of time: h times as large of harmonic h
+    magnitude = np.abs(factor)  # a phase error is one of time: h times as large for harmonic h
     harmonics = (
-        np.stack([velocity[:, h] * size * (factor / size) ** h for h in keep_harmonics], axis=2)
+        np.stack(
+            [velocity[:, h] * magnitude * (factor / magnitude) ** h for h in keep_harmonics], axis=2
+        )
         if keep_harmonics
         else None
     )

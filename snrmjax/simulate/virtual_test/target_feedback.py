@@ -1,15 +1,15 @@
-"""Control-based continuation: a feedback that holds a target motion, and vanishes on it.
+"""Control-based continuation: feedback towards a target motion, noninvasive once it is reached.
 
 The voltage is k (w(t) − v(t)), w the target velocity. The target's fundamental is prescribed; its
 higher harmonics are set to those measured until the feedback has none of its own (Picard
-iteration), so that what drives the structure is a force of one frequency: motions that an open
-loop cannot hold, on the middle branch of a fold, are then held as any other. At fixed frequency
-the force over the amplitude is an S-curve; where force and velocity are in phase lies the
-backbone, found by the secant method in frequency.
+iteration), so that the structure is driven by a force of one frequency: motions that are unstable
+in open loop, on the middle branch between two folds, are stabilised like any other. At fixed
+frequency the force over the amplitude is an S-curve; the backbone, with force and velocity in
+phase, is located by the secant method in frequency.
 
 With a `filter_rate` only the fundamental is fed back, k (w − v₁) with v₁ from an adaptive filter:
-the voltage is then free of higher harmonics from the beginning, and modes above, which a feedback
-of the whole velocity might drive unstable, are left alone.
+the voltage then has no higher harmonics from the start, and higher modes, which feedback of the
+whole velocity might destabilise, are not affected.
 
 References: J. Sieber & B. Krauskopf, Nonlinear Dyn. 51 (2008) 365,
 doi:10.1007/s11071-007-9217-2; L. Renson, A. Gonzalez-Buelga, D. A. W. Barton & S. A. Neild,
@@ -35,37 +35,39 @@ from snrmjax.simulate.virtual_test.laboratory import (
 )
 from snrmjax.simulate.virtual_test.record_phasors import (
     HANN,
+    ControlledMotion,
     FourierState,
-    HeldMotion,
+    empty_filter,
     followed,
     noise_of_sample,
-    nothing_followed,
     scatter_of_ratio,
     through_hann_window,
 )
 
 _ORDERS = np.arange(1, 8)  # harmonics of the target
-_PHASE = np.radians(0.5)  # between force and velocity, below which a motion is on the backbone
-_STEADY = 0.01  # change of the velocity's fundamental between the halves of a record, relative
-_LARGEST = 100.0  # times the target, beyond which the loop is unstable
-_MOST_STEPS = 8  # of frequency at one amplitude
+_PHASE = np.radians(0.5)  # largest phase between force and velocity on the backbone
+_STEADY = 0.01  # largest relative change of the velocity fundamental between halves of a record
+_LARGEST = 100.0  # velocity over the target beyond which the loop is unstable
+_MOST_STEPS = 8  # in frequency at one amplitude
 _LARGEST_STEP = 0.02  # of the frequency, relative
-_NEXT_SEED = 7919  # a prime: noise of one run is not that of another test's
+_NEXT_SEED = 7919  # a prime, so that runs of different tests do not share their noise
 
 
 class FeedbackSettings(NamedTuple):
-    """The feedback and how long each measurement takes."""
+    """Settings of the feedback and of each measurement."""
 
     gain: float  # V s/m
     settle_cycles: int = 60
     record_cycles: int = 20
     picard_steps: int = 6
-    invasive: float = 0.02  # higher harmonics of the feedback over its fundamental, at most
-    filter_rate: float = 0.0  # 1/s, of the filter of the fundamental; 0 feeds the whole velocity
+    invasive: float = 0.02  # largest ratio of higher harmonics of the feedback to its fundamental
+    filter_rate: float = (
+        0.0  # 1/s, of the filter of the fundamental; 0 feeds back the whole velocity
+    )
 
 
 class SCurve(NamedTuple):
-    """Force over amplitude at one frequency, folds included; NaN where no motion was held."""
+    """Force over amplitude at one frequency, folds included; NaN where control failed."""
 
     velocity: Float[np.ndarray, " point"]  # m/s
     force: Float[np.ndarray, " point"]  # N
@@ -87,14 +89,14 @@ class TargetFeedback(AbstractController):
     def step(
         self, state: Float[Array, ""], sample: Sample, period: Float[Array, ""]
     ) -> tuple[Array, Array, Array]:
-        """The voltage that pulls the velocity towards the target."""
+        """The voltage that drives the velocity towards the target."""
         wanted = jnp.sum(jnp.real(self.target * jnp.exp(1j * _ORDERS * state)))
         voltage = self.gain * (wanted - sample.velocity)
         return jnp.mod(state + self.frequency * period, 2 * jnp.pi), voltage, state
 
 
 class FundamentalFeedback(AbstractController):
-    """The controller that feeds back what an adaptive filter follows of the fundamental."""
+    """The controller with feedback of the fundamental from an adaptive filter."""
 
     gain: Float[Array, ""]
     frequency: Float[Array, ""]  # rad/s
@@ -103,12 +105,12 @@ class FundamentalFeedback(AbstractController):
 
     def initial(self) -> tuple[Float[Array, ""], FourierState]:
         """The angle of the target, and the filter."""
-        return jnp.zeros(()), nothing_followed(1, _ORDERS)
+        return jnp.zeros(()), empty_filter(1, _ORDERS)
 
     def step(
         self, state: tuple[Float[Array, ""], FourierState], sample: Sample, period: Float[Array, ""]
     ) -> tuple[tuple[Array, FourierState], Array, Array]:
-        """The voltage that pulls the velocity's fundamental towards the target."""
+        """The voltage that drives the velocity's fundamental towards the target."""
         angle, filters = state
         fraction = self.filter_rate * period
         filters = followed(filters, sample.velocity[None], angle, _ORDERS, fraction)
@@ -118,7 +120,7 @@ class FundamentalFeedback(AbstractController):
 
 
 class FeedbackBench:
-    """The laboratory under a target feedback as it goes on from one measurement to the next.
+    """The laboratory under target feedback, with its state kept between measurements.
 
     Raises `ValueError` for settings that are not positive.
     """
@@ -137,7 +139,7 @@ class FeedbackBench:
 
     @property
     def seconds(self) -> float:
-        """How long all measurements took."""
+        """Duration of all measurements in s."""
         return self.runs * (self.settle + self.keep) / self.laboratory.sampling_rate
 
     def _feedback(self, frequency: float, amplitude: float) -> AbstractController:
@@ -149,8 +151,8 @@ class FeedbackBench:
         target = np.concatenate([[amplitude], self.higher])
         return TargetFeedback(gain, omega, jnp.asarray(target))
 
-    def motion(self, frequency: float, amplitude: float) -> HeldMotion:
-        """The motion under a target of this amplitude (m/s), higher harmonics left alone."""
+    def motion(self, frequency: float, amplitude: float) -> ControlledMotion:
+        """The motion under a target of this amplitude (m/s), with its own higher harmonics."""
         for _ in range(self.settings.picard_steps):
             self.runs += 1
             record, self.state = run_test(
@@ -164,10 +166,10 @@ class FeedbackBench:
                 np.asarray(column)[-self.keep :]
                 for column in (record.report, record.force, record.velocity, record.voltage)
             )
-            # A diverging loop may leave numbers whose squares overflow, or none at all.
+            # A diverging loop may give numbers whose squares overflow, or NaN.
             if not np.abs(velocity).max() < _LARGEST * amplitude:
                 self.state, self.higher = None, np.zeros_like(self.higher)
-                return HeldMotion(False, frequency)
+                return ControlledMotion(False, frequency)
             moved, drive, pushed = (_harmonics(x, angle) for x in (velocity, voltage, force))
             invasive = float(np.linalg.norm(drive[1:]) / np.abs(drive[0]))
             self.higher = moved[1:]
@@ -178,14 +180,14 @@ class FeedbackBench:
             for part in (slice(self.keep // 2), slice(self.keep // 2, None))
         ]
         unsteady = float(abs(halves[1] - halves[0]) / abs(moved[0]))
-        # Of noise alone: a Hann window keeps so much of the variance of a mean.
+        # From noise alone: 1σ of an amplitude through a Hann window over that of a sample.
         fraction = np.sqrt(2 * HANN / self.keep)
         noise = [
-            fraction * noise_of_sample(signal, angle) / abs(size)
-            for signal, size in ((force, pushed[0]), (velocity, moved[0]))
+            fraction * noise_of_sample(signal, angle) / abs(amplitude_of)
+            for signal, amplitude_of in ((force, pushed[0]), (velocity, moved[0]))
         ]
         scatter = np.sqrt(HANN) * scatter_of_ratio(force, velocity, angle)
-        return HeldMotion(
+        return ControlledMotion(
             held=invasive < self.settings.invasive and unsteady < _STEADY,
             frequency=frequency,
             force=complex(pushed[0]),
@@ -195,18 +197,18 @@ class FeedbackBench:
             invasive=invasive,
         )
 
-    def resonance(self, omega: float, amplitude: float) -> HeldMotion:
+    def resonance(self, omega: float, amplitude: float) -> ControlledMotion:
         """The motion in phase with its force at one amplitude, by the secant method.
 
-        Starts at the frequency `omega` (rad/s); not `held` where the phase is beyond 0.5°.
+        Starts at the frequency `omega` (rad/s); not `held` if the phase stays beyond 0.5°.
         """
         before: tuple[float, float] | None = None
         for _ in range(_MOST_STEPS):
-            found = self.motion(omega, amplitude)
-            phase = float(np.angle(found.velocity / found.force))
-            if not abs(phase) >= _PHASE:  # on the backbone, or lost
-                return found
-            # A mode's tan φ = (ω̃² − Ω²)/(2ζ̃ω̃Ω): straight in frequency, with slope −1/(ζ̃ω̃).
+            motion = self.motion(omega, amplitude)
+            phase = float(np.angle(motion.velocity / motion.force))
+            if not abs(phase) >= _PHASE:  # on the backbone, or control lost (NaN)
+                return motion
+            # A mode's tan φ = (ω̃² − Ω²)/(2ζ̃ω̃Ω): linear in frequency, with slope −1/(ζ̃ω̃).
             error = np.tan(np.clip(phase, -1.4, 1.4))
             step = self.laboratory.decay * error
             if before is not None and before[1] != error:
@@ -214,7 +216,7 @@ class FeedbackBench:
                 step = secant if abs(secant) < 10 * abs(step) else step
             before = omega, float(error)
             omega += float(np.clip(step, -_LARGEST_STEP * omega, _LARGEST_STEP * omega))
-        return found._replace(held=False)
+        return motion._replace(held=False)
 
 
 def _harmonics(signal: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -234,20 +236,22 @@ def s_curve(
     """Force over velocity at one frequency, by raising the target's amplitude.
 
     Arguments: `frequency` in rad/s; `amplitudes` of the target in m/s, above those that result,
-    since the feedback leaves a distance. Returns an `SCurve`: where the force falls while the
-    velocity rises, an open loop under that force would jump. Motions whose feedback kept harmonics
-    of its own, or that were not steady within 1 %, are NaN.
+    since proportional feedback leaves an offset. Returns an `SCurve`: where the force falls while
+    the velocity rises, the motion is unstable in open loop. Motions with invasive feedback, or that
+    were not steady within 1 %, are NaN.
     Raises `ValueError` for numbers that are not positive.
     Not differentiable: differentiate the steady states of a model by
     `snrmjax.simulate.periodic_motion`.
     """
     (omega,) = positive("frequency", frequency)
     bench = FeedbackBench(laboratory, settings, seed)
-    found = [bench.motion(float(omega), float(size)) for size in positive("amplitudes", amplitudes)]
-    held = np.array([motion.held for motion in found])
+    motions = [
+        bench.motion(float(omega), float(value)) for value in positive("amplitudes", amplitudes)
+    ]
+    held = np.array([motion.held for motion in motions])
     return SCurve(
-        np.where(held, np.abs([motion.velocity for motion in found]), np.nan),
-        np.where(held, np.abs([motion.force for motion in found]), np.nan),
-        np.array([motion.invasive for motion in found]),
+        np.where(held, np.abs([motion.velocity for motion in motions]), np.nan),
+        np.where(held, np.abs([motion.force for motion in motions]), np.nan),
+        np.array([motion.invasive for motion in motions]),
         bench.seconds,
     )

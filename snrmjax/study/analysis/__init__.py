@@ -1,1 +1,1 @@
-"""What a study's data set says: outputs, their distributions and effects, bands, failures."""
+"""Evaluation of a study's data set: outputs, distributions, effects, bands, failures."""

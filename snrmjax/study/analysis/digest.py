@@ -28,14 +28,14 @@ from snrmjax.study.uncertainty.sensitivity import (
 if TYPE_CHECKING:
     import xarray
 
-_UNSURE = 0.1  # half width of a share from which it is called uncertain
-_OVERLAP = 0.02  # by which shares may add up to more than one
+_UNSURE = 0.1  # half width from which a fraction is reported as uncertain
+_OVERLAP = 0.02  # tolerated excess of the sum of fractions over one
 
 Effects = dict[str, MainEffect | None]  # by quantity; None where there are too few members
 
 
 class OutputEffects(NamedTuple):
-    """One output, for every force, and what each varied quantity alone does to it."""
+    """One output, for every force, and its main effects."""
 
     outputs: Sequence[Scalar]
     effects: Sequence[Effects]
@@ -50,12 +50,12 @@ class StudyDigest(NamedTuple):
     summaries: list[ScalarSummary]
     effects: list[OutputEffects]  # of the outputs that vary
     failures: Failures
-    sampling: str  # how the members were chosen; empty where the data set does not say
+    sampling: str  # sampling method; empty if not in the data set
     sensor: str  # of peaks and velocities; empty likewise
 
     @property
     def n_members(self) -> int:
-        """How many members there are."""
+        """Number of members."""
         return len(self.failures.failed)
 
     @property
@@ -66,7 +66,7 @@ class StudyDigest(NamedTuple):
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """What a reader of the numbers should know."""
+        """Notes on the numbers."""
         facts = []
         if self.sampling in ("grid", "list"):
             facts.append(Fact("members_chosen", method=self.sampling))
@@ -93,10 +93,10 @@ class StudyDigest(NamedTuple):
             facts.append(Fact("too_few_for_fractions", fewest=FEWEST, outputs=tuple(sorted(few))))
         if unsure:
             facts.append(Fact("fractions_uncertain", limit=_UNSURE, outputs=tuple(sorted(unsure))))
-        together = correlated_pairs(self.quantities)
-        if together:
-            facts.append(Fact("varied_together", pairs=tuple(together)))
-        elif any(_certain(effects) > 1 + _OVERLAP for _, effects in self.each_effect):
+        pairs_varied = correlated_pairs(self.quantities)
+        if pairs_varied:
+            facts.append(Fact("varied_together", pairs=tuple(pairs_varied)))
+        elif any(_least_sum(effects) > 1 + _OVERLAP for _, effects in self.each_effect):
             facts.append(Fact("fractions_above_one"))
         return facts
 
@@ -127,13 +127,13 @@ def digest(data: "xarray.Dataset") -> StudyDigest:
 
 
 def ranked_effects(effects: Effects) -> list[tuple[str, MainEffect]]:
-    """The quantities by their share of the variance, the largest first."""
+    """The quantities by their fraction of the variance, the largest first."""
     known = [(name, one) for name, one in effects.items() if one is not None]
     return sorted(known, key=lambda pair: -pair[1].fraction)
 
 
 def effects_frame(study: StudyDigest) -> pd.DataFrame:
-    """The table that is main_effects.csv: all shares of variance, of members with a number."""
+    """The table main_effects.csv: fractions of variance over members with a value."""
     return pd.DataFrame(
         {
             "variable": output.name,
@@ -152,8 +152,8 @@ def _named(scalar: Scalar) -> tuple[str, float | None]:
     return scalar.name, scalar.force
 
 
-def _certain(effects: Effects) -> float:
-    """What the shares add up to at least."""
+def _least_sum(effects: Effects) -> float:
+    """Lower bound of the sum of the fractions."""
     return sum(
         effect.fraction - effect.half_width for effect in effects.values() if effect is not None
     )

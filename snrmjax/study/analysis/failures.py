@@ -1,4 +1,4 @@
-"""Where members of a study failed: by status, and in the space of what varies."""
+"""Failed members of a study: by status, and over the varied quantities."""
 
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,33 +16,33 @@ _BINS = 10
 
 
 class Failures(NamedTuple):
-    """How the members ended. A member with several forces failed if it failed for one of them."""
+    """Statuses of the members. A member fails if it fails for one of its forces."""
 
     counts: dict[str, int]  # by status, of all members and forces
     failed: Bool[np.ndarray, " member"]
-    status: np.ndarray  # of each member: the first that is no success, or its own
-    below: int  # members with a peak that is known to lie below the range of frequencies only
+    status: np.ndarray  # of each member: its first failure, else its success
+    below: int  # members whose only peak is known to be below the frequency range
     above: int
 
     @property
     def n_failed(self) -> int:
-        """How many members failed."""
+        """Number of failed members."""
         return int(self.failed.sum())
 
     @property
     def failed_counts(self) -> dict[str, int]:
-        """How many members failed with each status, the most frequent first."""
+        """Number of failed members by status, the most frequent first."""
         return dict(Counter(self.status[self.failed].tolist()).most_common())
 
     @property
     def failed_kinds(self) -> tuple[tuple[str, int], ...]:
-        """The same by the names of the statuses alone, without reasons."""
+        """Number of failed members by status name, without reasons."""
         kinds = (name.partition(":")[0] for name in self.status[self.failed].tolist())
         return tuple(Counter(kinds).most_common())
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """What to do about members whose resonance is not in the range of a study of peaks."""
+        """Notes on members whose resonance is outside the range of a study of peaks."""
         facts, counts = [], self.failed_counts
         if MemberStatus.NO_PEAK in counts:
             n_members = counts[MemberStatus.NO_PEAK]
@@ -58,7 +58,7 @@ class Failures(NamedTuple):
 
 
 class FailureFraction(NamedTuple):
-    """Share of members that failed over equally populated parts of one varied quantity."""
+    """Fraction of failed members in equally populated bins of one varied quantity."""
 
     edges: Float[np.ndarray, " edge"]
     fraction: Float[np.ndarray, " part"]
@@ -67,7 +67,7 @@ class FailureFraction(NamedTuple):
 
 
 def failures_of(data: "xarray.Dataset") -> Failures:
-    """How the members of a data set ended."""
+    """Statuses of the members of a data set."""
     status = data["status"].values.astype(str)
     rows = status.reshape(len(status), -1)
     bad = np.asarray(~np.isin(rows, COMPLETE))
@@ -81,7 +81,7 @@ def failures_of(data: "xarray.Dataset") -> Failures:
 def failure_fraction(
     quantity: Float[np.ndarray, " member"], failed: Bool[np.ndarray, " member"]
 ) -> FailureFraction:
-    """Share of failed members along one quantity, with 95 % intervals (Wilson)."""
+    """Fraction of failed members over one quantity, with 95 % intervals (Wilson)."""
     from scipy.stats import binomtest
 
     edges = np.unique(np.quantile(quantity, np.linspace(0, 1, _BINS + 1)))
@@ -95,12 +95,12 @@ def failure_fraction(
     return FailureFraction(edges, np.where(n > 0, k / np.maximum(n, 1), np.nan), low, high)
 
 
-def most_telling(
+def ranked_by_failure(
     quantities: dict[str, Float[np.ndarray, " member"]], failed: Bool[np.ndarray, " member"]
 ) -> list[str]:
-    """Names of what varies, first those whose values differ most between failed and whole members.
+    """Names of the varied quantities by how well they separate failed from successful members.
 
-    By the Kolmogorov–Smirnov distance of the two groups.
+    Ranked by the Kolmogorov–Smirnov distance of the two groups.
     """
     from scipy.stats import ks_2samp
 

@@ -1,4 +1,4 @@
-"""What a study's data set has one number of for every member, and how it is distributed."""
+"""Scalar outputs of a study's data set, and their distributions."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 QUANTILES = (2.5, 25.0, 50.0, 75.0, 97.5)  # per cent
 _ENDS = ((0, "smallest"), (-1, "largest"))
 _OF_THE_PEAK = ("peak_frequency_hz", "resonance_frequency_hz")
-_ROUNDING = 1e-12  # relative differences that are none
+_ROUNDING = 1e-12  # relative differences due to rounding
 
 
 class Scalar(NamedTuple):
-    """One number of every member, NaN where a member has none.
+    """A scalar output of every member, NaN where a member has none.
 
-    A frequency that is known to lie beyond an end of the computed range is -inf or inf.
+    A frequency known to be below or above the computed range is -inf or inf.
     """
 
     name: str  # of the variable
@@ -36,12 +36,12 @@ class Scalar(NamedTuple):
 
     @property
     def n_known(self) -> int:
-        """How many members have a number."""
+        """Number of members with a value."""
         return int(np.isfinite(self.values).sum())
 
     @property
     def is_count(self) -> bool:
-        """Whether it counts something, such as folds or points."""
+        """Whether it is a count, such as of folds or points."""
         return self.name.startswith(("n_", "first_"))
 
     @property
@@ -52,18 +52,17 @@ class Scalar(NamedTuple):
 
 
 class ScalarSummary(NamedTuple):
-    """How one output is distributed over the members that have it.
+    """Distribution of one output over the members that have it.
 
-    Members of which it is known that their value lies below or above the computed range count with
-    the others: quantiles and extremes are -inf or inf where they lie there, and no mean is known.
-    NaN where no member has a value.
+    Members whose value is known to be below or above the computed range are included: quantiles
+    and extremes are -inf or inf there, and the mean is unknown. NaN where no member has a value.
     """
 
     scalar: Scalar  # without its values
     varies: bool
     members: int
-    missing: int  # members of which nothing is known: all the rest is of the others
-    below: int  # members below the range, of the others
+    missing: int  # members without a value, not included below
+    below: int  # members below the range
     above: int
     mean: float
     std: float  # of a sample: n - 1
@@ -73,12 +72,12 @@ class ScalarSummary(NamedTuple):
 
     @property
     def described(self) -> int:
-        """Members whose distribution this is."""
+        """Number of members in the distribution."""
         return self.members - self.missing
 
     @property
     def outside(self) -> int:
-        """Members whose value lies beyond the computed range."""
+        """Number of members with a value outside the computed range."""
         return self.below + self.above
 
 
@@ -104,7 +103,7 @@ def summarized(scalar: Scalar) -> ScalarSummary:
 
 
 def _quantiles(values: Float[np.ndarray, " member"]) -> Float[np.ndarray, " quantile"]:
-    """Between two members on a straight line, or the nearest one where one of them is infinite."""
+    """Linear interpolation between members, or the nearest one where one of two is infinite."""
     finite = values[np.isfinite(values)]
     if finite.size == values.size:
         return np.percentile(values, QUANTILES)
@@ -117,10 +116,10 @@ def _quantiles(values: Float[np.ndarray, " member"]) -> Float[np.ndarray, " quan
 
 
 def summary_frame(rows: Iterable[ScalarSummary]) -> pd.DataFrame:
-    """The table that is summary.csv, in the units of the data set.
+    """The table summary.csv, in the units of the data set.
 
-    Statistics are of the `members` but those `without_value`; -inf and inf are below and above the
-    computed range.
+    Statistics exclude the members `without_value`; -inf and inf are below and above the computed
+    range.
     """
     return pd.DataFrame(
         {
@@ -143,7 +142,7 @@ def summary_frame(rows: Iterable[ScalarSummary]) -> pd.DataFrame:
 
 
 def varied_quantities(data: "xarray.Dataset") -> dict[str, Float[np.ndarray, " member"]]:
-    """Values of every quantity that is stated for the members, by name."""
+    """Values of every varied quantity, by name."""
     return {
         str(name): np.asarray(one.values, dtype=np.float64)
         for name, one in data.coords.items()
@@ -152,9 +151,9 @@ def varied_quantities(data: "xarray.Dataset") -> dict[str, Float[np.ndarray, " m
 
 
 def scalars(data: "xarray.Dataset") -> Iterator[Scalar]:
-    """Every output that is one number a member, one at a time, and one for each force.
+    """Every scalar output, separately for each force.
 
-    Beside the variables over `member` alone: the lowest and the highest frequency of a fold, and
+    In addition to the variables over `member`: the lowest and the highest frequency of a fold, and
     identified curves at the smallest and the largest amplitude.
     """
     for key, variable in data.data_vars.items():
@@ -179,11 +178,11 @@ def scalars(data: "xarray.Dataset") -> Iterator[Scalar]:
         has, first = data["n_folds"].values > 0, data["first_fold"].values
         for which, reduce, end in (("lowest", np.fmin, -1), ("highest", np.fmax, 1)):
             values = np.full(has.shape, np.nan)
-            if has.any():  # rows are in the order of members: one's end is the next one's beginning
+            if has.any():  # rows are in the order of members, as `reduceat` needs
                 values[has] = reduce.reduceat(folds, first[has])
             text, ends = f"{which} frequency at which the response folds", {}
             if PEAK_SIDE in data:
-                # A curve that leaves the range between its folds has one of them beyond it.
+                # An odd number of folds: the range ends between two, and one of them is outside.
                 beyond = (data["n_folds"].values % 2 == 1) & (data[PEAK_SIDE].values == end)
                 values, ends = np.where(beyond, end * np.inf, values), {"ends": range_of(data)}
             yield from _by_force(data, f"{which}_fold_frequency_hz", "Hz", text, values, **ends)

@@ -1,1 +1,1 @@
-"""What a study can compute for every member: one class each."""
+"""Computations of a study for every member: one class each."""

@@ -1,4 +1,4 @@
-"""What is computed for every member of a study, and what comes out of it."""
+"""Base of the computations for every member of a study, and their outputs."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -20,12 +20,12 @@ PEAK_SIDE = "peak_side"
 
 
 class MemberStatus(StrEnum):
-    """How a member ended, beside the names of `CurveStatus` in small letters."""
+    """Status of a member, in addition to the names of `CurveStatus` in small letters."""
 
     SOLVED = "solved"
     ANSWERED = "answered"
-    LARGEST_VELOCITY = "largest_velocity"  # was reached, as asked for
-    NO_PEAK = "no_peak_in_range"  # of a response that was traced, like the next two
+    LARGEST_VELOCITY = "largest_velocity"  # was reached, as requested
+    NO_PEAK = "no_peak_in_range"  # the response was computed; likewise for the next two
     HIGHEST_AT_END = "highest_at_range_end"
     PEAK_NOT_LOCATED = "peak_not_located"
     REFUSED = "refused"
@@ -36,11 +36,11 @@ COMPLETE = (
     *(MemberStatus.SOLVED, MemberStatus.ANSWERED, MemberStatus.LARGEST_VELOCITY),
     *("upper_end", "lower_end", "closed"),
 )
-"""Statuses of members that have their whole result."""
+"""Statuses of members with a whole result."""
 
 
 class Failure(NamedTuple):
-    """Why a member has no result; the store has both in one text."""
+    """Why a member has no result; the store has both fields as one text."""
 
     status: MemberStatus
     reason: str
@@ -50,7 +50,7 @@ class Failure(NamedTuple):
 
 
 def refusal(error: ValueError) -> Failure:
-    """That a member was refused, by the first line of the reason."""
+    """The failure of a refused member, with the first line of the error."""
     return Failure(MemberStatus.REFUSED, str(error).splitlines()[0])
 
 
@@ -65,7 +65,7 @@ class Output(NamedTuple):
     kind: str  # "f8", "i4", "i1" or "text"
     unit: str
     meaning: str
-    at_sensor: bool = False  # whether it is that of one sensor
+    at_sensor: bool = False  # whether it refers to one sensor
 
 
 class Axis(NamedTuple):
@@ -81,41 +81,41 @@ class Members(NamedTuple):
 
     models: Sequence[Structure]
     forces: Float[np.ndarray, "member force"] | None  # N, where `force_n` varies or is given
-    seeds: Sequence[int]  # of each member's own noise
+    seeds: Sequence[int]  # of each member's noise
 
 
 class AbstractComputation(eqx.Module):
-    """One kind of thing that a study computes; `kind` is its name in study files."""
+    """A kind of computation; `kind` is its name in study files."""
 
     kind: ClassVar[str]
-    members_a_chunk: ClassVar[int]  # small enough to lose, large enough to be worth a file
+    members_a_chunk: ClassVar[int]  # small enough to recompute, large enough for a file
 
     @abc.abstractmethod
     def outputs(self) -> dict[str, Output]:
-        """What every member gives, by name; `status` says how its computation ended."""
+        """The outputs of every member by name; `status` is how its computation ended."""
 
     @abc.abstractmethod
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """The outputs of some members, in order; a member that fails has its status and NaN."""
 
     def axes(self) -> dict[str, Axis]:
-        """Dimensions beside `member` and `force_n` whose values all members share."""
+        """Dimensions other than `member` and `force_n`, with values common to all members."""
         return {}
 
     def sensor(self, modes: LinearModes) -> str | None:
-        """The sensor of the outputs that are those of one: the first; None if there are none."""
-        told = any(output.at_sensor for output in self.outputs().values())
-        return modes.sensors[0] if told else None
+        """The sensor of outputs at one sensor, the first one; None without such outputs."""
+        at_sensor = any(output.at_sensor for output in self.outputs().values())
+        return modes.sensors[0] if at_sensor else None
 
 
 class OfForces(eqx.Module):
-    """The forces of a study, all of which every member is computed for."""
+    """The forces of a study; every member is computed for all of them."""
 
     values: Float[np.ndarray, " force"] | None = None  # N; None: `force_n` varies
 
     @property
     def dimensions(self) -> tuple[str, ...]:
-        """Of what has one value for every member and force."""
+        """Dimensions of outputs with one value for every member and force."""
         several = self.values is not None and len(self.values) > 1
         return (MEMBER, FORCE) if several else (MEMBER,)
 
@@ -132,7 +132,7 @@ class OfForces(eqx.Module):
         return np.tile(np.asarray(self.values), (len(members.models), 1))
 
     def shaped(self, values: np.ndarray) -> np.ndarray:
-        """Values of all members and forces, in the order of members, with their dimensions."""
+        """Values of all members and forces, in the order of members, reshaped to `dimensions`."""
         if len(self.dimensions) == 1:
             return values
         return values.reshape(-1, len(np.asarray(self.values)), *values.shape[1:])
@@ -146,7 +146,7 @@ def of_forces(values: OfForces | Sequence[float] | np.ndarray | None) -> OfForce
 
 
 def blank_rows(outputs: dict[str, Output], sizes: dict[str, int], why: Failure) -> dict[str, Any]:
-    """Rows of members for which there is nothing but a failure."""
+    """Rows of members without a result: status and NaN."""
     rows = {}
     for name, output in outputs.items():
         shape = tuple(sizes.get(dimension, 0) for dimension in output.dimensions)
@@ -162,30 +162,30 @@ def with_refused(
     rows: dict[str, np.ndarray] | None,
     refused: Mapping[int, Failure],
 ) -> dict[str, np.ndarray]:
-    """Rows of members, with those in between that have no result.
+    """Rows of all members, including those without a result.
 
-    Arguments: `rows` of the others, in order; None: there are none. `refused` are the rest
-    by their place among all.
+    Arguments: `rows` of the members with a result, in order, or None; `refused` are the others
+    by their index among all.
     """
     outputs = computation.outputs()
     sizes = {name: len(axis.values) for name, axis in computation.axes().items()}
     blanks = [blank_rows(outputs, {MEMBER: 1, **sizes}, why) for why in refused.values()]
     whole = joined([*([] if rows is None else [rows]), *blanks])
     n = len(whole["status"])
-    places = [*(k for k in range(n) if k not in refused), *refused]
-    order = np.argsort(places)
-    # What has any number of rows a member is in order already: these members have none.
+    indices = [*(k for k in range(n) if k not in refused), *refused]
+    order = np.argsort(indices)
+    # Ragged outputs are already in order: refused members have no rows in them.
     of_members = {name for name, one in outputs.items() if one.dimensions[0] == MEMBER}
     return {name: v[order] if name in of_members else v for name, v in whole.items()}
 
 
 def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Rows of members after one another."""
+    """Concatenated rows of members."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 class AbstractSingly(AbstractComputation):
-    """What is computed member by member; a `ValueError` becomes the member's status."""
+    """Computation member by member; a `ValueError` becomes the member's status."""
 
     @abc.abstractmethod
     def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:

@@ -33,7 +33,9 @@ class AbstractModes(AbstractSingly):
     """A nonlinear mode of every member, point by point."""
 
     members_a_chunk: ClassVar[int] = 32
-    further: ClassVar[tuple[str, str, str]]  # what a point has beside frequency and velocity
+    further: ClassVar[
+        tuple[str, str, str]
+    ]  # output of a point in addition to frequency and velocity
 
     def outputs(self) -> dict[str, Output]:
         """See `AbstractComputation.outputs`."""
@@ -72,7 +74,7 @@ class DampedModes(AbstractModes):
         """See `AbstractSingly.member`."""
         mode = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
         rows = _rows(mode.status, mode.frequency, np.abs(mode.velocity[:, 1, 0]))
-        if mode.status == CurveStatus.AMPLITUDE_LIMIT:  # which was asked for: a whole mode
+        if mode.status == CurveStatus.AMPLITUDE_LIMIT:  # as requested: a whole mode
             rows["status"] = np.array([MemberStatus.LARGEST_VELOCITY])
         return {**rows, "point_damping_ratio": mode.damping_ratio}
 

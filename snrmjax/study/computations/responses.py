@@ -1,4 +1,4 @@
-"""Forced responses of the members: their peaks, resonances and folds, or the whole curves."""
+"""Forced responses of the members: peaks, resonances and folds, or whole curves."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -32,7 +32,7 @@ GRID = "frequency_hz"
 
 
 class ResponseRange(eqx.Module):
-    """Which responses: frequencies in rad/s, and how they are computed."""
+    """Frequency range in rad/s and settings of the responses."""
 
     from_frequency: float
     to_frequency: float
@@ -46,7 +46,7 @@ class ResponseRange(eqx.Module):
 
     @property
     def settings(self) -> ResponseSettings:
-        """As simulations have them."""
+        """The settings of `forced_response_batch`."""
         return ResponseSettings(harmonic_order=self.harmonic_order, stability=self.stability)
 
 
@@ -80,7 +80,7 @@ class AbstractResponses(AbstractComputation):
     def traced(
         self, members: Members
     ) -> tuple[Sequence[tuple[ResponseCurve, ...]], dict[str, np.ndarray]]:
-        """The curves of every member and force, and what `outputs` has of them."""
+        """The curves of every member and force, and their rows of `outputs`."""
         loads, within = self.forces.of(members), self.within
         models = [m for m in members.models for _ in range(loads.shape[1])]
         batch = forced_response_batch(models, loads.ravel(), *within.ends, settings=within.settings)
@@ -100,12 +100,12 @@ class Peaks(AbstractResponses):
 
     A member whose response has no peak between the ends of the range has the status
     `no_peak_in_range`; one whose response is higher at an end than at its highest peak has
-    `highest_at_range_end`: the resonance lies outside, and a wider range would have it. One that is
-    higher somewhere between its ends has `peak_not_located`, and no peak.
+    `highest_at_range_end`: the resonance is outside, and a wider range would include it. Where the
+    largest computed point is not a located peak, the status is `peak_not_located` and the peak is
+    missing.
 
     `forces` in N; None: `force_n` varies. With `grid_points` also the highest and the lowest
-    velocity of the response at that many frequencies: what the response bands of a report are made
-    of.
+    velocity of the response at that many frequencies, for the response bands of a report.
     """
 
     kind: ClassVar[str] = "peaks"
@@ -116,7 +116,7 @@ class Peaks(AbstractResponses):
     grid_points: int = eqx.field(static=True, default=0)
 
     def outputs(self) -> dict[str, Output]:
-        """Those of responses, and bounds on the grid."""
+        """Outputs of responses, and bounds on the grid."""
         named = super().outputs()
         if self.grid_points:
             for name, which in (("upper", "highest"), ("lower", "lowest")):
@@ -139,7 +139,7 @@ class Peaks(AbstractResponses):
         ends = zip(curves, batch_status, strict=True)
         rows["status"] = self.forces.shaped(np.array([peak_status(*end) for end in ends]))
         if self.grid_points:
-            # Of a curve that stopped early nobody knows the rest.
+            # A curve that stopped early is incomplete and gives no bounds.
             whole = zip(curves, batch_status, strict=True)
             bounds = np.array(
                 [velocity_bounds(c if s in COMPLETE else (), self._grid) for c, s in whole]
@@ -166,7 +166,7 @@ class Curves(AbstractResponses):
     forces: OfForces = eqx.field(default=None, converter=of_forces)
 
     def outputs(self) -> dict[str, Output]:
-        """Those of responses, and their points."""
+        """Outputs of responses, and their points."""
         at = ("point",)
         return {
             **super().outputs(),
@@ -197,9 +197,9 @@ class Curves(AbstractResponses):
 
 
 def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:
-    """The status of a response whose highest peak is asked for.
+    """The status of a response with respect to its highest peak.
 
-    Arguments: `status` says how its curves ended; one that stopped early keeps it.
+    Arguments: `status` of the continuation; it is kept for a curve that stopped early.
     """
     if status not in COMPLETE:
         return status
@@ -217,12 +217,12 @@ def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:
 
 
 def peak_side(curves: Sequence[ResponseCurve], status: str) -> int:
-    """Beyond which end of the range a response without a peak in it has its peak.
+    """Side of the range on which a response without a peak in it has its peak.
 
     The velocity of a structure under a bounded force falls to zero far from its resonances: where
-    the highest branch still rises at an end of the range, a peak lies beyond that end. Returns 1
-    for above, -1 for below; 0 where there is a peak in the range, where the curve stopped early,
-    and where the response rises at both ends or at none.
+    the highest branch still rises at an end of the range, there is a peak beyond that end. Returns
+    1 for above, -1 for below; 0 for a peak in the range, for a curve that stopped early, and where
+    the response rises at both ends or at neither.
     """
     if peak_status(curves, status) != MemberStatus.NO_PEAK:
         return 0
@@ -252,13 +252,13 @@ def bounds_over(
     curve: Int[np.ndarray, " row"],
     x: Float[np.ndarray, " row"],
     y: Float[np.ndarray, " row"],
-    at: Float[np.ndarray, " place"],
+    at: Float[np.ndarray, " point"],
     begins: Bool[np.ndarray, " row"],
     n_curves: int,
-) -> tuple[Float[np.ndarray, "curve place"], Float[np.ndarray, "curve place"]]:
-    """Lowest and highest y of curves made of polylines at rising places x, NaN outside them.
+) -> tuple[Float[np.ndarray, "curve point"], Float[np.ndarray, "curve point"]]:
+    """Lowest and highest y of curves of polylines at rising abscissae `at`, NaN outside them.
 
-    Arguments: `curve` is the number of the curve of every point, `begins` whether a point begins a
+    Arguments: `curve` is the number of the curve of every point, `begins` whether a point starts a
     polyline.
     """
     same = ~begins[1:]
@@ -266,13 +266,13 @@ def bounds_over(
     first = np.searchsorted(at, np.minimum(x0, x1), side="left")
     count = np.searchsorted(at, np.maximum(x0, x1), side="right") - first
     segment = np.repeat(np.arange(len(x0)), count)
-    place = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count - first, count)
+    index = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count - first, count)
     width = np.where(x1 == x0, 1.0, x1 - x0)
-    value = y0[segment] + (at[place] - x0[segment]) / width[segment] * (y1 - y0)[segment]
+    value = y0[segment] + (at[index] - x0[segment]) / width[segment] * (y1 - y0)[segment]
     of_curve = curve[1:][same][segment]
     low, high = np.full((n_curves, len(at)), np.inf), np.full((n_curves, len(at)), -np.inf)
-    np.minimum.at(low, (of_curve, place), value)
-    np.maximum.at(high, (of_curve, place), value)
+    np.minimum.at(low, (of_curve, index), value)
+    np.maximum.at(high, (of_curve, index), value)
     none = ~np.isfinite(high)
     return np.where(none, np.nan, low), np.where(none, np.nan, high)
 

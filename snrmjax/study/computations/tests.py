@@ -1,4 +1,4 @@
-"""What a test of every member would find: virtual tests, identifications, diagnoses."""
+"""Tests of every member: virtual tests, identifications, diagnoses."""
 
 from typing import ClassVar
 
@@ -29,7 +29,7 @@ from snrmjax.study.computations.responses import ResponseRange
 FRACTION = "relative_amplitude"
 _POINTS = 11  # of a curve over the measured range
 _CURVE = (MEMBER, FRACTION)
-_FOUND = {
+_OUTPUTS = {
     "status": Output((MEMBER,), TEXT, "", "solved, or why not"),
     "n_states": Output((MEMBER,), "i4", "1", "steady states of the test"),
     "n_solved": Output((MEMBER,), "i4", "1", "steady states that the inverse method solved"),
@@ -42,11 +42,11 @@ _FOUND = {
 
 
 class AbstractIdentified(AbstractSingly):
-    """Backbone and damping by the pointwise inverse method, at shares of the amplitude range."""
+    """Backbone and damping by the pointwise inverse method, at fractions of the amplitude range."""
 
     def outputs(self) -> dict[str, Output]:
         """See `AbstractComputation.outputs`."""
-        return _FOUND
+        return _OUTPUTS
 
     def axes(self) -> dict[str, Axis]:
         """See `AbstractComputation.axes`."""
@@ -54,7 +54,7 @@ class AbstractIdentified(AbstractSingly):
         return {FRACTION: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
 
     def sensor(self, modes: LinearModes) -> str:
-        """That where the mode of interest moves most, whatever the order of the sensors."""
+        """The sensor with the largest shape of the mode of interest."""
         return modes.sensors[reference_sensor(modes)]
 
     def identified(self, data: SteadyStates, model: Structure) -> dict[str, np.ndarray]:
@@ -78,7 +78,7 @@ class AbstractIdentified(AbstractSingly):
 
 
 class VirtualTests(AbstractIdentified):
-    """A virtual near-resonance test of every member with its own noise, then its identification.
+    """A virtual near-resonance test of every member with its own noise, and its identification.
 
     `levels` are the forces of the test in N.
     """

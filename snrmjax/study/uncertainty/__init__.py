@@ -1,1 +1,1 @@
-"""How uncertain responses are where the parameters are, and which of them makes them so."""
+"""Uncertainty of responses from that of parameters, and its attribution to them."""

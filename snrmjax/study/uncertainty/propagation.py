@@ -15,9 +15,9 @@ METHOD_NAMES = ("first order", "second order")
 STATISTICS = ("mean", "std", "lower", "upper")  # lower, upper: 2.5 and 97.5 % points
 ERRORS = ("mean", "std", "range")
 _TAILS = (0.025, 0.975)
-_MEMBERS = 2**14  # of a quadratic, whose percentage points are read from them
+_MEMBERS = 2**14  # samples of a quadratic for its percentage points
 _SCALES = np.geomspace(1e-3, 1e3, 121)
-_WRONG = 0.1  # error of first order that is worth a note
+_WRONG = 0.1  # error of first order above which a note is given
 
 Statistics = Float[np.ndarray, "statistic quantity"]
 
@@ -25,10 +25,10 @@ Statistics = Float[np.ndarray, "statistic quantity"]
 class Propagation(AbstractResult):
     """Mean, standard deviation and 95 % range of quantities by first and by second order.
 
-    `first_order_error` is what first order lacks against second order: of its mean in standard
-    deviations, of its standard deviation, and of the farther end of its 95 % range in half widths.
-    `scatter_limit` is the factor on all inputs' scatter from which that is 10 %: 1 is the scatter
-    as stated.
+    `first_order_error` is the error of first order relative to second order: of its mean in
+    standard deviations, of its standard deviation, and of the worse end of its 95 % range in half
+    widths. `scatter_limit` is the factor on all inputs' scatter at which it reaches 10 %: 1 is the
+    stated scatter.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ("quantity", "approach", "statistic", "error")
@@ -46,7 +46,7 @@ class Propagation(AbstractResult):
     notes: tuple[Fact, ...] = setting()
 
     def summary(self) -> tuple[str, ...]:
-        """A line a quantity and method, then what is wrong."""
+        """A line per quantity and method, then the notes."""
         about = self.quantities
         lines = [
             f"uncertainty of {len(about.names)} quantities by {about.gradient.shape[1]} numbers"
@@ -62,7 +62,7 @@ class Propagation(AbstractResult):
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """Statistics by method, what first order lacks, and the values at the medians."""
+        """Statistics by method, errors of first order, and the values at the medians."""
         labels = {
             "quantity": (self.quantities.names, "quantity"),
             "approach": ([name.replace(" ", "_") for name in METHOD_NAMES], "method"),
@@ -83,14 +83,14 @@ class Propagation(AbstractResult):
 def propagate_uncertainty(quantities: Quantities) -> Propagation:
     """Uncertainty of quantities from that of their inputs, by derivatives at the medians.
 
-    With f(z) the quantity by independent standard normal numbers, g its gradient and H its Hessian
-    at z = 0 (automatic differentiation): first order is f(0) with variance gᵀg; second order
-    f(0) + ½ tr H with variance gᵀg + ½ tr H² and the percentage points of the quadratic. Notes
-    name the quantities of which first order is wrong by more than a tenth.
+    With the quantity f(z) of independent standard normal numbers z, its gradient g and Hessian H at
+    z = 0 (automatic differentiation), first order has mean f(0) and variance gᵀg, second order
+    mean f(0) + ½ tr H, variance gᵀg + ½ tr H² and the percentage points of the quadratic. Notes
+    name the quantities with a first-order error above 10 %.
 
     Arguments: `quantities` by `response_quantities`, or `function_quantities` of your own function.
-    Validity: the derivatives know nothing of what happens away from the medians. To solve members
-    instead, make a `Study` of the same variations.
+    Validity: local derivatives at the medians; for larger scatter make a `Study` of the same
+    variations.
     Not differentiable: `snrmjax.study.response_quantities` gives derivatives; in a program of your
     own differentiate `snrmjax.simulate.periodic_motion`.
     Reference: Anderson, J. Aircraft 36 (1999) and Putko et al., J. Fluids Eng. 124 (2002) 60,
@@ -128,10 +128,10 @@ def propagate_uncertainty(quantities: Quantities) -> Propagation:
 
 
 def first_order(about: Quantities, scale: float = 1.0) -> Statistics:
-    """Statistics of f₀ + gᵀz, z standard normal numbers times `scale`: normal."""
-    spread = scale * np.linalg.norm(about.gradient, axis=1)
-    reach = float(stats.norm.ppf(_TAILS[1])) * spread
-    return np.stack([about.value, spread, about.value - reach, about.value + reach])
+    """Statistics of the normal f₀ + gᵀz, z standard normal numbers times `scale`."""
+    std = scale * np.linalg.norm(about.gradient, axis=1)
+    half_width = float(stats.norm.ppf(_TAILS[1])) * std
+    return np.stack([about.value, std, about.value - half_width, about.value + half_width])
 
 
 def second_order(about: Quantities) -> Statistics:
@@ -146,40 +146,39 @@ def second_order(about: Quantities) -> Statistics:
 
 
 def first_order_error(first: Statistics, reference: Statistics) -> Float[np.ndarray, "error q"]:
-    """By how much first order errs, relative to the reference's spread; a row of `ERRORS` each.
+    """Error of first order relative to the reference's scatter; a row for each of `ERRORS`.
 
-    Its mean in reference standard deviations; its standard deviation; and the farther end of its
+    Its mean in reference standard deviations; its standard deviation; and the worse end of its
     95 % range in half widths of the reference range.
     """
-    spread, half_width = reference[1], 0.5 * (reference[3] - reference[2])
+    std, half_width = reference[1], 0.5 * (reference[3] - reference[2])
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.max(np.abs(first[2:] - reference[2:]), axis=0) / half_width
-        mean = np.abs(first[0] - reference[0]) / spread
-        return np.stack([mean, np.abs(first[1] / spread - 1), ends])
+        mean = np.abs(first[0] - reference[0]) / std
+        return np.stack([mean, np.abs(first[1] / std - 1), ends])
 
 
 def scatter_limit(about: Quantities, error: float = 0.1) -> Float[np.ndarray, "error q"]:
-    """The scale of all inputs' scatter from which first order errs by `error`, by second order.
+    """The factor on all inputs' scatter at which the first-order error reaches `error`.
 
-    1 is the stated scatter; a row of `ERRORS` each. Found by Brent's method where the error first
-    passes the value; infinite where it does not up to a scale of 1000.
+    1 is the stated scatter; a row for each of `ERRORS`, relative to second order. The first
+    crossing by Brent's method; infinite where there is none up to a factor of 1000.
     """
     linear, quadratic = _members(about)
 
     def excess(scale: float) -> Float[np.ndarray, "error q"]:
-        mine = first_order(about, scale)
-        # First order is sampled with the same members, so that the sequence's own error does not
-        # count.
-        ends = mine[2:] - np.quantile(scale * linear, _TAILS, axis=0)
+        first = first_order(about, scale)
+        # Both orders are sampled with the same members, so that the sampling error cancels.
+        ends = first[2:] - np.quantile(scale * linear, _TAILS, axis=0)
         ends = ends + np.quantile(scale * linear + scale**2 * quadratic, _TAILS, axis=0)
-        return first_order_error(mine, np.stack([*_exact(about, scale), *ends])) - error
+        return first_order_error(first, np.stack([*_exact(about, scale), *ends])) - error
 
     above = np.array([excess(float(scale)) for scale in _SCALES]) > 0
     result = np.full(above.shape[1:], np.inf)
     for row, q in np.argwhere(above.any(axis=0)).tolist():
         k = int(np.argmax(above[:, row, q]))
         if k == 0:
-            result[row, q] = 0.0  # no gradient: first order errs at any scatter
+            result[row, q] = 0.0  # no gradient: first order is wrong at any scatter
             continue
         root = optimize.brentq(
             lambda log_scale, row=row, q=q: excess(float(np.exp(log_scale)))[row, q],
@@ -199,7 +198,7 @@ def _exact(about: Quantities, scale: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _members(about: Quantities) -> tuple[np.ndarray, np.ndarray]:
-    """Linear and quadratic part of members of the quadratic, of unit scatter."""
+    """Linear and quadratic part of samples of the quadratic, for unit scatter."""
     n = about.gradient.shape[1]
     (seed,) = np.random.SeedSequence([0, 1]).spawn(1)
     sequence = stats.qmc.Sobol(n, rng=np.random.default_rng(seed))

@@ -1,4 +1,4 @@
-"""Quantities of uncertain numbers with both derivatives: events of a response, or any function."""
+"""Quantities of uncertain inputs with gradient and Hessian: response events or any function."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, get_args
@@ -26,9 +26,9 @@ ModelOf = Callable[[dict[str, Array]], Structure]
 
 
 class Quantities(eqx.Module):
-    """Named quantities about z = 0, by the standard normal numbers z of what is uncertain.
+    """Named quantities with derivatives over the standard normal numbers z of the inputs, at z = 0.
 
-    Every uncertain number has its median at z = 0, which for a lognormal one is below its mean.
+    Every input has its median at z = 0, which for a lognormal one is below its mean.
     """
 
     value: Float[np.ndarray, " quantity"] = eqx.field(converter=np.asarray)
@@ -43,7 +43,7 @@ def function_quantities(
     varied: Sequence[AbstractVariation],
     names: Sequence[str],
 ) -> Quantities:
-    """The results of a JAX function of a vector of the uncertain numbers.
+    """The results of a JAX function of the vector of uncertain inputs.
 
     >>> from snrmjax.study.variations import Normal
     >>> varied = Normal("a", 1.0, 0.1), Normal("b", 2.0, 0.2)
@@ -70,22 +70,22 @@ def response_quantities(
     harmonic_order: int = 9,
     model_of: ModelOf | None = None,
 ) -> Quantities:
-    """Frequency (Hz) and velocity (m/s) of a response's events, by uncertain numbers.
+    """Frequency (Hz) and velocity (m/s) of a response's events over uncertain inputs.
 
-    The response at their medians is traced once. Of it are taken the highest peak of the
-    velocity fundamental at the first sensor, every fold in order along the curve and the strongest
-    phase resonance. Each solves the harmonic balance with its condition (see `periodic_motion`),
-    whose first and second derivatives follow from the implicit function theorem.
+    The response at their medians is computed once. Its events are the highest peak of the velocity
+    fundamental at the first sensor, every fold in order along the curve and the strongest phase
+    resonance. Each solves the harmonic balance with its condition (see `periodic_motion`), whose
+    first and second derivatives follow from the implicit function theorem.
 
     Arguments: `varied` as in a `Study`, by the names of `snrmjax.model.parameter_names` and
     "force_n"; frequencies in rad/s, the range of the nominal response; `force` in N, unless it is
-    uncertain; `model_of`, a differentiable JAX function that makes the model of the numbers by
-    name, where they are no parameters of `model` (dimensions, say).
-    Returns `Quantities`; kinds of which the nominal curve has none are in its `notes`.
+    uncertain; `model_of`, a differentiable JAX function that makes the model from the inputs by
+    name, where they are not parameters of `model` (such as dimensions).
+    Returns `Quantities`; its `notes` name kinds without an event on the nominal curve.
     Raises `ValueError` for unknown names or kinds, a force that is missing or given twice, and
     where the nominal curve has none of the events.
-    Validity: derivatives know nothing of what happens away from the medians (folds that merge,
-    another peak that becomes the highest): a `Study` of the same `varied` does.
+    Validity: derivatives are local to the medians and do not include folds that merge or another
+    peak that becomes the highest; a `Study` of the same `varied` does.
 
     >>> from snrmjax.model import flat_beam
     >>> from snrmjax.study.variations import Normal
@@ -138,15 +138,15 @@ def response_quantities(
 
 
 def _events(curves: Sequence[ResponseCurve], kind: EventKind) -> list[tuple[ResponseCurve, int]]:
-    """Where the events are: folds in order, of others the one with the largest velocity."""
-    places = [(curve, int(k)) for curve in curves for k in curve.at_events(kind)]
-    if kind == "fold" or not places:
-        return places
-    return [max(places, key=lambda at: float(np.abs(at[0].velocity[at[1], 1, 0])))]
+    """Events of one kind: all folds in order, else the one with the largest velocity."""
+    events = [(curve, int(k)) for curve in curves for k in curve.at_events(kind)]
+    if kind == "fold" or not events:
+        return events
+    return [max(events, key=lambda at: float(np.abs(at[0].velocity[at[1], 1, 0])))]
 
 
 class _Inputs(NamedTuple):
-    """What is uncertain, as a function of standard normal numbers."""
+    """Uncertain inputs as functions of standard normal numbers."""
 
     varied: tuple[AbstractVariation, ...]
 
@@ -164,10 +164,10 @@ class _Inputs(NamedTuple):
 
 
 class _Series(NamedTuple):
-    """A model whose numbers are a quadratic of z: all that two derivatives at z = 0 ask for.
+    """A model whose numbers are a quadratic in z, sufficient for two derivatives at z = 0.
 
-    A beam is condensed by many steps: within the program of a response they would be compiled
-    anew for every kind of event.
+    The condensation of a beam has many steps, which would otherwise be compiled into the program
+    of every kind of event.
     """
 
     template: Structure
@@ -177,8 +177,8 @@ class _Series(NamedTuple):
 
     def model(self, z: Float[Array, " input"]) -> Structure:
         """The model at z."""
-        roughness = jnp.einsum("nij,i,j->n", self.curvature, z, z)
-        numbers = self.numbers + self.slopes @ z + 0.5 * roughness
+        quadratic = jnp.einsum("nij,i,j->n", self.curvature, z, z)
+        numbers = self.numbers + self.slopes @ z + 0.5 * quadratic
         arrays, others = eqx.partition(self.template, _is_number)
         return eqx.combine(ravel_pytree(arrays)[1](numbers), others)
 
@@ -188,7 +188,7 @@ class _Nominal(NamedTuple):
 
     model: Structure
     force: Float[np.ndarray, ""]  # N, where it is not uncertain
-    series: _Series | None  # where what is uncertain are no numbers of the model
+    series: _Series | None  # for inputs that are not parameters of the model
 
     def at(self, inputs: _Inputs, z: Float[Array, " input"]) -> tuple[Structure, Float[Array, ""]]:
         """Model and force at standard normal numbers."""
@@ -216,7 +216,7 @@ def _is_number(leaf: object) -> bool:
 def _derivatives(
     function: Callable[[Array], tuple[Array, Any]], inputs: _Inputs
 ) -> tuple[Any, ...]:
-    """Value, gradient and Hessian at z = 0 of the first result, then the second as it is."""
+    """Value, gradient and Hessian at z = 0 of the first result, then the second result."""
 
     def value(z: Array) -> tuple[Array, tuple[Array, Any]]:
         first, rest = function(z)
@@ -252,7 +252,7 @@ def _of_model(model_of: ModelOf, inputs: _Inputs) -> tuple[Array, ...]:
 def _of_event(
     nominal: _Nominal, inputs: _Inputs, kind: EventKind, start: tuple
 ) -> tuple[Array, ...]:
-    """Frequency (Hz) and velocity with derivatives, and whether the motion was found."""
+    """Frequency (Hz) and velocity with derivatives, and whether the motion converged."""
 
     def pair(z: Array) -> tuple[Array, Array]:
         model, force = nominal.at(inputs, z)

@@ -1,9 +1,9 @@
-"""Which varied quantities make a study's outputs vary: main effects and Sobol' indices.
+"""Variance-based sensitivity of a study's outputs: main effects and Sobol' indices.
 
-The first-order index S = Var(E[y | x])/Var(y) is by how much the variance of the output y would
-fall on average if x were known. `main_effect` reads it off the members of any sample, as the
-variance of a curve; `sobol_indices` off the pairs of Saltelli's scheme, together with the total
-index, which such a curve cannot give.
+The first-order index S = Var(E[y | x])/Var(y) is the average relative reduction of the variance of
+the output y if x were known. `main_effect` estimates it from any sample, as the variance of a
+regression curve; `sobol_indices` from the pairs of Saltelli's scheme, together with the total
+index, which a curve cannot give.
 """
 
 import json
@@ -19,8 +19,8 @@ from snrmjax.numerics.result import AbstractResult, quantity, setting
 if TYPE_CHECKING:
     import xarray
 
-FEWEST = 50  # members from which shares are estimated
-_FEW_VALUES = 12  # a quantity that takes no more than these has a mean for each
+FEWEST = 50  # members for an estimate of fractions
+_FEW_VALUES = 12  # up to this number of distinct values each has its own mean
 _PIECES, _MEMBERS_A_PIECE = 7, 64
 _DEGREE = 3
 _GROUPS = 20  # of the jackknife
@@ -31,17 +31,17 @@ _NORMAL_95 = 1.959964  # half width of the 95 % interval, in 1σ
 
 
 class MainEffect(NamedTuple):
-    """What one varied quantity alone does to an output."""
+    """Main effect of one varied quantity on an output."""
 
     fraction: float  # first-order index
     half_width: float  # of its 95 % interval
-    at: Float[np.ndarray, " place"]  # values of the quantity
-    mean: Float[np.ndarray, " place"]  # conditional mean of the output
-    error: Float[np.ndarray, " place"]  # half width of the 95 % band of that mean
+    at: Float[np.ndarray, " point"]  # values of the quantity
+    mean: Float[np.ndarray, " point"]  # conditional mean of the output
+    error: Float[np.ndarray, " point"]  # half width of the 95 % band of that mean
 
 
 class SobolIndices(AbstractResult):
-    """Shares of an output's variance by varied quantity: alone (first), with interactions (total).
+    """Fractions of an output's variance by quantity: alone (first), with interactions (total).
 
     Quantities that vary together are one input. Half widths are of 95 % intervals, by bootstrap.
     """
@@ -69,12 +69,12 @@ class SobolIndices(AbstractResult):
     notes: tuple[Fact, ...] = setting()
 
     def summary(self) -> tuple[str, ...]:
-        """Inputs of every quantity by their total index."""
+        """Inputs of every quantity, ranked by their total index."""
         lines = [f"Sobol' indices of {len(self.names)} quantities"]
         for q, name in enumerate(self.names):
-            spread = f"{name}: {np.sqrt(self.variance[q]):.3g} {self.units[q]} (1σ)"
+            head = f"{name}: {np.sqrt(self.variance[q]):.3g} {self.units[q]} (1σ)"
             part = f", of {self.rows[q]} of {self.n_rows} rows"
-            lines.append(spread + (part if self.rows[q] < self.n_rows else ""))
+            lines.append(head + (part if self.rows[q] < self.n_rows else ""))
             for k in np.argsort(-self.total[q]).tolist():
                 lines.append(
                     f"  {self.input_names[k]}: first {self.first[q, k]:.3f} ±"
@@ -87,11 +87,11 @@ class SobolIndices(AbstractResult):
 def main_effect(
     quantity: Float[np.ndarray, " member"], output: Float[np.ndarray, " member"]
 ) -> MainEffect | None:
-    """Share of variance and conditional mean of an output over one quantity.
+    """Fraction of variance and conditional mean of an output over one quantity.
 
-    The conditional mean is a cubic regression spline, or the mean of each value where the quantity
-    takes few. Members without an output are left out. The share is corrected for the freedom of
-    the curve (adjusted R²), its interval is by the jackknife over twenty groups of members.
+    The conditional mean is a cubic regression spline, or the mean at each value where the quantity
+    takes few. Members without an output are left out. The fraction is corrected for the degrees of
+    freedom of the curve (adjusted R²), its interval is by jackknife over twenty groups of members.
     Returns None with fewer than `FEWEST` members, or where one of the two does not vary.
     """
     known = np.isfinite(output) & np.isfinite(quantity)
@@ -106,7 +106,7 @@ def main_effect(
     basis = _levels if listed else _splines
     scale = y.std()
     centred = (y - y.mean()) / scale
-    # Sums over members from which a fit follows: products of the basis, the output and one.
+    # Normal equations by groups: products of basis, output and one, summed over members.
     table = np.column_stack([basis(x, knots), centred, np.ones(len(y))])
     groups = [table[k::_GROUPS].T @ table[k::_GROUPS] for k in range(_GROUPS)]
     total = np.sum(groups, axis=0)
@@ -120,7 +120,7 @@ def main_effect(
 
 
 def correlated_pairs(quantities: dict[str, Float[np.ndarray, " member"]]) -> list[tuple[str, str]]:
-    """Varied quantities whose ranks are correlated: shares then overlap."""
+    """Varied quantities with correlated ranks, whose fractions overlap."""
     from scipy.stats import rankdata
 
     names = [name for name, values in quantities.items() if np.ptp(values) > 0]
@@ -135,13 +135,13 @@ def correlated_pairs(quantities: dict[str, Float[np.ndarray, " member"]]) -> lis
 def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
     """First-order and total Sobol' indices of a study's outputs, with 95 % intervals.
 
-    S_i = Var(E[f | x_i])/Var(f) is the share of the variance that input i makes by itself; the
-    total index T_i = E[Var(f | all but x_i)]/Var(f) has its interactions too. A row of Saltelli's
-    scheme of which one member has no value is left out whole.
+    S_i = Var(E[f | x_i])/Var(f) is the fraction of the variance due to input i alone; the total
+    index T_i = E[Var(f | all but x_i)]/Var(f) includes its interactions. A row of Saltelli's scheme
+    with a member without value is left out.
 
     Arguments: `data` of a study whose sampling is "saltelli", by `open_study`; `seed` of the
-    bootstrap. Returns `SobolIndices` of every output that is one number a member (and force); NaN
-    for one that does not vary or of which few rows are left.
+    bootstrap. Returns `SobolIndices` of every scalar output (for each force); NaN for one that does
+    not vary or has few complete rows.
     Raises `ValueError` for a study with another sampling.
     Reference: Saltelli et al., Comput. Phys. Commun. 181 (2010) 259,
     doi:10.1016/j.cpc.2009.09.018.
@@ -151,7 +151,7 @@ def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
     if method != "saltelli":
         raise ValueError(
             "Sobol' indices need the members of Saltelli's scheme, but the study's sampling is "
-            f'{method}: take method = "saltelli".'
+            f'{method}: use method = "saltelli".'
         )
     inputs = [", ".join(one["names"]) for one in study["variations"]]
     columns, units = _outputs(data)
@@ -186,7 +186,7 @@ def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
 
 
 def _outputs(data: "xarray.Dataset") -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """Every output that is a number for each member, or for each member and force, and its unit."""
+    """Scalar outputs, separately for each force, and their units."""
     columns, units = {}, []
     for name, one in data.data_vars.items():
         if one.dtype.kind != "f" or one.dims not in (("member",), ("member", "force_n")):
@@ -207,26 +207,26 @@ def _indices(values: Float[np.ndarray, "row member"], seed: int) -> Float[np.nda
         first = np.mean(other * (mixed - base), axis=-2) / variance
         return np.stack([first, np.mean((base - mixed) ** 2, axis=-2) / (2 * variance)])
 
-    # Centred: the product of the first index loses digits to a mean.
+    # Centred to avoid cancellation in the product of the first index.
     centred = values - values.mean()
     drawn = np.random.default_rng(seed + 1).integers(len(values), size=(_RESAMPLES, len(values)))
-    with np.errstate(invalid="ignore"):  # rows drawn again and again may not vary
+    with np.errstate(invalid="ignore"):  # a resample may have no variance
         half_width = _NORMAL_95 * np.nanstd(of(centred[drawn]), axis=1, ddof=1)
     return np.stack([of(centred), half_width], axis=1).reshape(4, -1)
 
 
 def _fit(sums: Float[np.ndarray, "sum sum"]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Coefficients, their covariance and the adjusted R²; a place without members has neither."""
+    """Coefficients, their covariance and the adjusted R²; zero where there are no members."""
     basis, with_output, n = sums[:-2, :-2], sums[:-2, -2], sums[-1, -1]
     inverse = np.linalg.pinv(basis, rcond=1e-10, hermitian=True)
     coefficients = inverse @ with_output
-    left = max(sums[-2, -2] - coefficients @ with_output, 0.0) / max(n - len(coefficients), 1)
+    residual = max(sums[-2, -2] - coefficients @ with_output, 0.0) / max(n - len(coefficients), 1)
     variance = (sums[-2, -2] - sums[-2, -1] ** 2 / n) / (n - 1)
-    return coefficients, inverse * left, float(1.0 - left / variance)
+    return coefficients, inverse * residual, float(1.0 - residual / variance)
 
 
 def _knots(x: Float[np.ndarray, " member"]) -> Float[np.ndarray, " knot"]:
-    """Knots of a clamped spline: as many members lie in every piece."""
+    """Knots of a clamped spline with equally many members per piece."""
     pieces = int(np.clip(len(x) // _MEMBERS_A_PIECE, 1, _PIECES))
     inner = np.unique(np.quantile(x, np.linspace(0, 1, pieces + 1)))
     return np.concatenate([[inner[0]] * _DEGREE, inner, [inner[-1]] * _DEGREE])
@@ -234,7 +234,7 @@ def _knots(x: Float[np.ndarray, " member"]) -> Float[np.ndarray, " knot"]:
 
 def _splines(
     x: Float[np.ndarray, " member"], knots: Float[np.ndarray, " knot"]
-) -> Float[np.ndarray, "member place"]:
+) -> Float[np.ndarray, "member basis"]:
     from scipy.interpolate import BSpline
 
     return BSpline.design_matrix(x, knots, _DEGREE).toarray()

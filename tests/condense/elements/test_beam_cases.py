@@ -30,13 +30,13 @@ def test_flat_beam_has_the_cubic_coefficient_of_von_karman():
     mass = 7870.0 * width * thickness
     exact = 204.8e9 * width * thickness / (2 * length) * (slopes / (mass * length**2)) ** 2
     beam = Beam(length, width, thickness, **_FLAT)
-    basis, cases, found = _condensed(beam, (1,), 0.1 * thickness)
-    by_monomial = dict(zip(found.monomials, found.coefficient, strict=True))
+    basis, cases, result = _condensed(beam, (1,), 0.1 * thickness)
+    by_monomial = dict(zip(result.monomials, result.coefficient, strict=True))
     # Loads of a tenth of the thickness: the other modes hardly follow.
     assert abs(4 * by_monomial[(0, 0, 0, 0)] / exact - 1) < 2e-3
     # The strain energy is that of the potential: an independent output of the elements.
     q = np.asarray(cases.modal_displacement)
-    energy = 0.5 * (q**2 * basis.frequency**2).sum(axis=1) + found.energy(jnp.asarray(q))
+    energy = 0.5 * (q**2 * basis.frequency**2).sum(axis=1) + result.energy(jnp.asarray(q))
     np.testing.assert_allclose(energy, cases.energy, rtol=1e-6)
 
 
@@ -44,8 +44,8 @@ def test_curved_beam_softens_then_hardens_as_galerkins_arch():
     length, width, thickness = 0.3048, 0.0127, 0.508e-3
     rise = rise_of_radius(length, 11.43)
     beam = Beam(length, width, thickness, rise=rise, young=204e9, density=7860.0)
-    basis, _, found = _condensed(beam, (1,), 0.02 * thickness)
-    quadratic, cubic = found.coefficient * jnp.array([3.0, 4.0])
+    basis, _, result = _condensed(beam, (1,), 0.02 * thickness)
+    quadratic, cubic = result.coefficient * jnp.array([3.0, 4.0])
     # Towards the centre (q < 0) softer at first, and harder beyond; the backbone turns downwards.
     assert quadratic > 0
     assert 0 < 9 * cubic * basis.frequency[0] ** 2 < 10 * quadratic**2

@@ -36,8 +36,8 @@ def _root(function, low, high):
 def test_second_frequency_of_slender_beams(left, right, root):
     # Rotary inertia lowers it by (βh/L)²/24: 4e-5 at most. Twelve cubic elements: 2e-5 high.
     exact = root**2 / _L**2 * np.sqrt(_EI / _MASS)
-    found = beam_modes(_beam(left=left, right=right), (2,)).frequency[0]
-    assert abs(found / exact - 1) < 8e-5
+    result = beam_modes(_beam(left=left, right=right), (2,)).frequency[0]
+    assert abs(result / exact - 1) < 8e-5
 
 
 def test_a_mass_at_the_tip_lowers_the_frequency():
@@ -48,9 +48,9 @@ def test_a_mass_at_the_tip_lowers_the_frequency():
         return own + ratio * x * (np.cos(x) * np.sinh(x) - np.sin(x) * np.cosh(x))
 
     tip = PointMass(1.0, ratio * _MASS * _L)
-    found = beam_modes(_beam(right="free", point_masses=[tip]), (1,)).frequency[0]
+    result = beam_modes(_beam(right="free", point_masses=[tip]), (1,)).frequency[0]
     exact = _root(characteristic, 0.5, 1.8) ** 2 / _L**2 * np.sqrt(_EI / _MASS)
-    assert abs(found / exact - 1) < 8e-5
+    assert abs(result / exact - 1) < 8e-5
 
 
 def test_participation_of_a_pinned_beam():

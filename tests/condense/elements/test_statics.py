@@ -43,10 +43,10 @@ def test_a_cantilever_is_the_elastica():
     beam = _beam(right="free")
     force = np.zeros((2, beam.n_dof))
     force[:, -2] = loads * _BENDING
-    found = static_solutions(beam, jnp.asarray(force))
-    assert found.converged.all()
+    result = static_solutions(beam, jnp.asarray(force))
+    assert result.converged.all()
     for row, load in enumerate(loads):
-        x, y, rotation = found.displacement[row, -3:]
+        x, y, rotation = result.displacement[row, -3:]
         angle, along, across = _elastica(load)
         np.testing.assert_allclose([rotation, 1 + x, y], [angle, along, across], rtol=2e-5)
 
@@ -64,10 +64,10 @@ def test_a_deep_arch_loses_its_stability_at_the_published_load():
         right="pinned",
     )
     load = jnp.zeros((1, beam.n_dof)).at[0, 3 * 20 + 1].set(-10.0)
-    found = static_solutions(beam, load)
-    assert found.status.tolist() == [StaticStatus.SNAPPED_THROUGH]
-    assert np.isnan(found.displacement).all()
-    assert abs(10 * found.load_fraction[0] - 8.97) < 0.01
+    result = static_solutions(beam, load)
+    assert result.status.tolist() == [StaticStatus.SNAPPED_THROUGH]
+    assert np.isnan(result.displacement).all()
+    assert abs(10 * result.load_fraction[0] - 8.97) < 0.01
 
 
 @pytest.mark.long

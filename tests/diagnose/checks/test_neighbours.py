@@ -1,4 +1,4 @@
-"""Noise that neighbouring states show, of made-up rows whose noise and order are known."""
+"""Noise from neighbouring states, for synthetic rows of known noise and order."""
 
 import numpy as np
 import pytest
@@ -22,17 +22,17 @@ def test_the_order_of_rows_does_not_change_the_noise_of_neighbours():
     rows = noise() + 3 * np.repeat(np.sin(np.pi * ANGLE), 2)
     shuffled = np.random.default_rng(2).permutation(N_STATES)
     mixed = rows.reshape(-1, 2)[shuffled].reshape(-1)
-    found = neighbour_noise(misfit_of(shuffled), fit_to(mixed))
-    assert found == pytest.approx(neighbour_noise(misfit_of(), fit_to(rows)), rel=1e-12)
-    assert found == pytest.approx(1.0, abs=3 * STD)
+    variance = neighbour_noise(misfit_of(shuffled), fit_to(mixed))
+    assert variance == pytest.approx(neighbour_noise(misfit_of(), fit_to(rows)), rel=1e-12)
+    assert variance == pytest.approx(1.0, abs=3 * STD)
 
 
 def test_its_error_is_the_scatter_of_many_sets():
-    found = [neighbour_noise(misfit_of(), fit_to(noise(seed))) for seed in range(200)]
-    assert np.std(found) == pytest.approx(STD, rel=0.2)
+    variances = [neighbour_noise(misfit_of(), fit_to(noise(seed))) for seed in range(200)]
+    assert np.std(variances) == pytest.approx(STD, rel=0.2)
 
 
-def test_errors_that_all_share_are_no_noise_of_neighbours():
+def test_shared_errors_are_no_noise_of_neighbours():
     """A shared error ten times as large as the noise, that alternates from state to state."""
     alternating = np.repeat((-1.0) ** np.arange(N_STATES), 2)[:, None]
     rows = noise() + 10 * alternating[:, 0]

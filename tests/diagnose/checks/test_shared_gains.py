@@ -1,4 +1,4 @@
-"""What an answer says of gains: of the force, of the modal mass."""
+"""Estimated gains of the force and of the modal mass."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from truths.balanced_sets import balanced, linear_model
 from truths.exact_states import GAIN, driven, modes
 
 import snrmjax as sj
-from snrmjax.diagnose.checks.gains import gain_found, modal_mass_found, notes_on_gains
+from snrmjax.diagnose.checks.gains import fitted_gain, fitted_modal_mass, notes_on_gains
 from snrmjax.diagnose.diagnosis import excluded_kinds
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.misfit.predictions import predictions_of
@@ -35,20 +35,20 @@ def misfit_of(factor, force_gain_std=0.0, change=np.zeros_like, *, known=True):
 
 
 def test_a_free_gain_is_found_with_its_error():
-    """Its 1σ is where χ², its prior's part too, has risen by 1."""
+    """Its 1σ is where χ², with the prior, rises by 1."""
     misfit = misfit_of(1.5, force_gain_std=1.0)
-    gain = gain_found(misfit, baseline_fit(misfit))
+    gain = fitted_gain(misfit, baseline_fit(misfit))
     assert gain.value == pytest.approx(1.5, rel=0.02)
     moved = np.linspace(0.4, 0.6, 5)
     risen = [np.sum((misfit.base + misfit.noise.shared[:, 0] * g) ** 2) + g**2 for g in moved]
     curvature = np.polyfit(moved, risen, 2)[0]
     assert gain.std == pytest.approx(curvature**-0.5 / 1.5, rel=0.01)
     certain = misfit_of(1.0)
-    assert gain_found(certain, baseline_fit(certain)) is None
+    assert fitted_gain(certain, baseline_fit(certain)) is None
 
 
-def test_a_stated_error_that_is_exceeded_is_said():
-    """Forces larger by a half ask for a damping ratio far beyond its 1σ of 1 %."""
+def test_an_exceeded_stated_error_is_reported():
+    """Forces larger by a half require a damping ratio far beyond its 1σ of 1 %."""
     misfit = misfit_of(1.5, known=False)
     (note,) = notes_on_gains(misfit, baseline_fit(misfit))
     assert [name for name, *_ in note["parameters"]] == ["mode_1.damping_ratio"]
@@ -57,8 +57,8 @@ def test_a_stated_error_that_is_exceeded_is_said():
 
 
 @pytest.mark.parametrize(("std", "kept"), [(0.05, True), (1.0, False)])
-def test_nothing_that_the_force_drives_is_looked_for_beside_a_free_gain(std, kept):
-    """A far mode beside a force of no size is a model that stands still, and fits anything."""
+def test_effects_driven_by_the_force_are_excluded_with_a_free_gain(std, kept):
+    """With a free gain near zero force, a residual mode alone could fit anything."""
     left_out = excluded_kinds(linear_model(), std, phases=True)
     assert ({"residual_mode", "close_mode"} <= left_out) is not kept
 
@@ -103,7 +103,7 @@ def true_mass():
 def test_a_stated_error_of_the_modal_mass_lets_the_data_find_it():
     misfit = misfit_of_mass(0.05)
     fit = baseline_fit(misfit)
-    found = modal_mass_found(misfit, fit)
+    found = fitted_modal_mass(misfit, fit)
     assert abs(found.value - true_mass()) < 3 * found.std
     assert found.std < 0.01 * true_mass()
     assert found.model == pytest.approx(WRONG * true_mass(), rel=1e-12)
@@ -117,23 +117,23 @@ def test_a_stated_error_of_the_modal_mass_lets_the_data_find_it():
     assert note["value"] == found.value
 
 
-def test_a_modal_mass_beyond_its_stated_error_is_said():
+def test_a_modal_mass_beyond_its_stated_error_is_reported():
     misfit = misfit_of_mass(0.02)
     assert list(notes_on_gains(misfit, baseline_fit(misfit)))[-1]["beyond"]
 
 
-def test_the_right_mass_and_a_free_gain_take_no_word():
+def test_a_correct_mass_and_a_free_gain_have_no_note():
     misfit = misfit_of_mass(0.05, wrong=1.0)
     assert list(notes_on_gains(misfit, baseline_fit(misfit))) == []
-    # A free gain of all forces is one with the mass: only one of them is free.
+    # A free force gain cannot be separated from the mass: only one of them is free.
     free = misfit_of_mass(0.05, force_gain_std=1.0)
-    assert modal_mass_found(free, baseline_fit(free)) is None
+    assert fitted_modal_mass(free, baseline_fit(free)) is None
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("std", [0.05, None])
 def test_a_wrong_modal_mass_is_never_named(std):
-    """Where nobody states it, its 1σ is taken for 5 %: that it is off by 6 % is no finding."""
+    """An unstated 1σ is taken as 5 %: a deviation of 6 % is not significant."""
     found = sj.diagnose_model(wrong_mass(std), states())
     assert found.verdict == "none"
     assert found.effects == ()

@@ -11,7 +11,7 @@ from snrmjax.diagnose.location.element_motion import (
     force_along,
 )
 
-ROW = np.array([0.0, 0.0, -1.0, 1.0])  # x4 less x3
+INFLUENCE = np.array([0.0, 0.0, -1.0, 1.0])  # x4 less x3
 CUBIC = 3e9
 
 
@@ -21,14 +21,14 @@ def spring(x, v):
 
 @pytest.fixture(scope="module")
 def states():
-    """Motions along the row, whose third harmonic is up to 9 %, and receptances there."""
+    """Motions along the influence vector, with up to 9 % third harmonic, and receptances."""
     found, x = [], None
     for omega in np.array([0.72, 0.78, 0.84]) * FIRST:
-        x = displacement(45.0, ROW, spring, omega, x)
-        turn = omega * np.arange(ORDER + 1)
-        stiffness = [STIFFNESS - w**2 * np.diag(MASS) + 1j * w * DAMPING for w in turn]
-        receptance = [ROW @ np.linalg.solve(s, ROW) for s in stiffness]
-        found.append((omega, np.array(receptance), ROW @ x))
+        x = displacement(45.0, INFLUENCE, spring, omega, x)
+        orders = omega * np.arange(ORDER + 1)
+        stiffness = [STIFFNESS - w**2 * np.diag(MASS) + 1j * w * DAMPING for w in orders]
+        receptance = [INFLUENCE @ np.linalg.solve(s, INFLUENCE) for s in stiffness]
+        found.append((omega, np.array(receptance), INFLUENCE @ x))
     omega, receptance, motion = map(np.array, zip(*found, strict=True))
     assert np.max(abs(motion[:, 3] / motion[:, 1])) > 0.09
     fundamental = np.where(np.arange(ORDER + 1) == 1, motion, 0.0)
@@ -40,12 +40,12 @@ def test_an_element_moves_with_its_own_harmonics(states):
     law = sj.model.make_effect("cubic_stiffness", {"coefficient": 1.0})
     found = element_forces(law, np.array([CUBIC]), element)
     assert found.settled.all()
-    size = abs(motion[:, 1:2])
+    amplitude = abs(motion[:, 1:2])
     # Newton's method ends below 1e-5 of the fundamental.
-    np.testing.assert_allclose(found.motion / size, motion / size, rtol=0, atol=1e-5)
-    # The force is what moves it: of orders that no load drives.
+    np.testing.assert_allclose(found.motion / amplitude, motion / amplitude, rtol=0, atol=1e-5)
+    # The motion is the response to the force, at orders without load.
     answer = -(element.receptance * found.force)[:, 2:]
-    np.testing.assert_allclose(answer / size, motion[:, 2:] / size, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(answer / amplitude, motion[:, 2:] / amplitude, rtol=0, atol=2e-5)
     along = force_along(law, np.array([CUBIC]), element)
     assert np.all(abs(found.force - along)[:, 1] > 0.02 * abs(along[:, 1]))
 
@@ -69,7 +69,7 @@ def test_slopes_are_those_of_differences(states, kind, values):
     for k, value in enumerate(values):
         step = 1e-3 * value * np.eye(len(values))[k]
         more, less = (element_forces(law, values + s, near).force for s in (step, -step))
-        size = np.max(abs(found.by_parameter[..., k]))
+        scale = np.max(abs(found.by_parameter[..., k]))
         slope = (more - less) / (2e-3 * value)
-        # Motions are found to 1e-5, differences have steps of 1e-3; sliders turn at samples.
-        np.testing.assert_allclose(found.by_parameter[..., k], slope, rtol=0, atol=0.03 * size)
+        # Motions are found to 1e-5, differences have steps of 1e-3; sliders reverse at samples.
+        np.testing.assert_allclose(found.by_parameter[..., k], slope, rtol=0, atol=0.03 * scale)

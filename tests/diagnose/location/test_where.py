@@ -1,4 +1,4 @@
-"""The place of a force; truth from a harmonic balance of a chain of its own."""
+"""Localisation of a force; truth from a separate harmonic balance of a chain."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from snrmjax.io.diagnosis_results import placed_answer, summarise_localisation
 from snrmjax.pipelines.diagnose import DiagnosedTest
 from snrmjax.report.pages.diagnosis import answer_in_words
 
-ROW = (0.0, -1.0, 1.0, 0.0)  # x3 less x2
+INFLUENCE = (0.0, -1.0, 1.0, 0.0)  # x3 less x2
 CUBIC = 2e7  # N/m³
 LAWS = ("cubic_stiffness", "quadratic_damping", "cubic_damping")  # all would take half a minute
 
@@ -28,20 +28,20 @@ def drag(x, v):
 
 
 @pytest.mark.parametrize("law", [hardening, drag])
-def test_sensors_tell_the_place_without_a_law(law):
+def test_sensors_locate_the_force_without_a_law(law):
     sensors = ("x1", "x2", "x4")
-    data, model = steady_states(ROW, law, sensors), structure(sensors)
+    data, model = steady_states(INFLUENCE, law, sensors), structure(sensors)
     candidates = ("x1", "x2", "x3", "x4", "x2-x1", "x3-x2", "x4-x3")
     found = sj.diagnose.locate_force(data, model, candidates, laws=LAWS)
     assert found.told
     assert found.places[0].name == "x3-x2"
     assert found.probability.sum() == pytest.approx(1.0, abs=1e-12)
-    # What is left is noise: 18 states of 5 orders and 3 sensors, 1σ of the root about 0.04.
+    # The residual is noise: 18 states of 5 orders and 3 sensors, 1σ of the root about 0.04.
     assert 0.8 < found.misfit < 1.2
 
 
-def test_one_sensor_tells_it_by_the_law():
-    data, model = steady_states(ROW, hardening, ("x4",)), structure(("x4",))
+def test_one_sensor_locates_it_by_the_law():
+    data, model = steady_states(INFLUENCE, hardening, ("x4",)), structure(("x4",))
     candidates = ("x1", "x3-x2", "x2", "x4", "x4-x3")
     found = sj.diagnose.locate_force(data, model, candidates, laws=LAWS)
     assert found.places[0].name == "x3-x2"
@@ -52,8 +52,8 @@ def test_one_sensor_tells_it_by_the_law():
     assert std < 0.05 * CUBIC
     assert found.explains
     assert found.model.effects[0].at == (("x3", 1.0), ("x2", -1.0))
-    told = summarise_localisation(found)
-    assert sum(told["where"].values()) == pytest.approx(1.0)
+    summary = summarise_localisation(found)
+    assert sum(summary["where"].values()) == pytest.approx(1.0)
     answer = placed_answer(found)
     assert answer["effects"] == ["cubic_stiffness"]
     assert sum(answer["probabilities"].values()) == pytest.approx(1.0)
@@ -87,7 +87,7 @@ def test_a_force_on_the_mode_is_everywhere():
     assert not found.explains
 
 
-def test_places_behind_one_sensor_want_another():
+def test_locations_behind_one_sensor_require_another():
     # Both sensors are on one side: a drag at x3 and at x4 moves them alike.
     sensors = ("x1", "x2")
     data, model = steady_states((0, 0, 0, 1.0), drag, sensors), structure(sensors)
@@ -96,8 +96,8 @@ def test_places_behind_one_sensor_want_another():
     assert found.settled_by in ("x3", "x4")
 
 
-def test_what_cannot_be_placed_is_told():
-    data, model = steady_states(ROW, hardening, ("x1", "x2")), structure(("x1", "x2"))
+def test_what_cannot_be_located_is_refused():
+    data, model = steady_states(INFLUENCE, hardening, ("x1", "x2")), structure(("x1", "x2"))
     with pytest.raises(ValueError, match="'x9', where the modes have no shape"):
         sj.diagnose.locate_force(data, model, ("x9",))
     unknown = sj.measure.steady_states(
@@ -116,7 +116,7 @@ def stiffening(x, v):
     return 3e9 * x**3
 
 
-def test_a_place_counts_with_the_own_harmonics_of_its_element():
+def test_a_location_is_fitted_with_the_harmonics_of_its_element():
     # Recorded are fundamentals only: the third harmonic of x4 − x3 is up to 9 % of its
     # fundamental, without which the coefficient is 8 % too low.
     sensors = ("x3", "x4")
@@ -131,10 +131,13 @@ def test_a_place_counts_with_the_own_harmonics_of_its_element():
     assert law.parameters["coefficient"] == pytest.approx(3e9, rel=0.04)
 
 
-def test_where_no_candidate_fits_the_words_say_so():
+def test_where_no_candidate_fits_this_is_reported():
     sensors = ("x1", "x2", "x4")
-    data, model = steady_states(ROW, hardening, sensors, forces=(2.0, 4.0)), structure(sensors)
+    data, model = (
+        steady_states(INFLUENCE, hardening, sensors, forces=(2.0, 4.0)),
+        structure(sensors),
+    )
     found = sj.diagnose.locate_force(data, model, ("x1", "x2-x1"), laws=LAWS)
     assert not found.fits
-    assert "a force at none of these places reproduces the measured response" in str(found.words)
+    assert "no single force at these points reproduces the measured response" in str(found.words)
     assert not summarise_localisation(found)["where_fits"]

@@ -1,4 +1,4 @@
-"""Diagnoses without phases: of sets that time integration made, whose phases were taken away."""
+"""Diagnoses without phases: of time-integrated sets without their phases."""
 
 import csv
 import dataclasses
@@ -15,7 +15,7 @@ import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import at_phases_of, fit_effect
-from snrmjax.diagnose.misfit.noise_model import Sizes, sizes_of
+from snrmjax.diagnose.misfit.noise_model import Magnitudes, magnitudes_of
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.identify.calibrate.calibration import calibrate_model
@@ -25,16 +25,16 @@ from snrmjax.numerics.facts import Fact
 
 
 def without_phases(data, rows=slice(None), seed=0):
-    """The data with phases of some rows turned at random and stated as unknown."""
-    turn = np.exp(2j * np.pi * np.random.default_rng(seed).uniform(size=data.n_states))
+    """The data with random phases in some rows, stated as unknown."""
+    rotation = np.exp(2j * np.pi * np.random.default_rng(seed).uniform(size=data.n_states))
     mine = np.zeros(data.n_states, dtype=bool)
     mine[rows] = True
-    turn = np.where(mine, turn, 1.0)[:, None]
+    rotation = np.where(mine, rotation, 1.0)[:, None]
     order = np.array(data.harmonic_order)
     return dataclasses.replace(
         data,
-        velocity=data.velocity * turn,
-        harmonics=data.harmonics * turn[..., None] ** order,
+        velocity=data.velocity * rotation,
+        harmonics=data.harmonics * rotation[..., None] ** order,
         phase_std=jnp.where(mine[:, None], np.radians(90.0), data.phase_std),
     )
 
@@ -47,7 +47,7 @@ def stripped(name):
 
 
 def at_starts(predictions, kind):
-    """What the first start of a kind makes of the states, by its first parameter."""
+    """Predictions at the first start of a kind, with derivatives by its first parameter."""
     one = candidate(kind, scales_of(predictions))
     labels = parameter_labels(kind)
     values = predictions.group.at(labels, np.array(one.starts[0]))
@@ -55,8 +55,8 @@ def at_starts(predictions, kind):
     return found._replace(slopes=one.unit[0] * found.slopes)
 
 
-def test_every_effect_has_the_same_sizes_whatever_the_phases():
-    """A motion has its force, whatever the time is counted from."""
+def test_magnitudes_of_every_effect_do_not_depend_on_the_phases():
+    """The force of a motion does not depend on the origin of time."""
     model, data = files("blind_03")
     measured, none = predictions_of(model, data), predictions_of(model, without_phases(data))
     base = alone(none).columns
@@ -67,16 +67,16 @@ def test_every_effect_has_the_same_sizes_whatever_the_phases():
             np.abs(unknown.phasors), np.abs(known.phasors), rtol=0, atol=2e-4, err_msg=kind
         )
         force = known.phasors[:, :, 0]
-        size, change = np.abs(force), known.slopes[:, :, 0, 0] + 1j * known.slopes[:, :, 1, 0]
+        magnitude, change = np.abs(force), known.slopes[:, :, 0, 0] + 1j * known.slopes[:, :, 1, 0]
         np.testing.assert_allclose(
-            unknown.columns[:, :, 0], size - 1, rtol=0, atol=2e-4, err_msg=kind
+            unknown.columns[:, :, 0], magnitude - 1, rtol=0, atol=2e-4, err_msg=kind
         )
-        slope = np.real(force.conj() * change) / size
+        slope = np.real(force.conj() * change) / magnitude
         np.testing.assert_allclose(
             unknown.slopes[:, :, 0, 0], slope, rtol=0, atol=2e-4, err_msg=kind
         )
         assert not np.any(unknown.columns[:, :, 1])
-        # It has strength at all, but for what acts on phases or on harmonics not seen here.
+        # Every effect changes them but for one of phases alone.
         change = np.abs(unknown.columns - base)
         assert (np.max(change) < 1e-6) == (kind == "sensor_phase_error"), kind
 
@@ -87,18 +87,18 @@ def alone(predictions):
     return predictions.of(group.values[None])
 
 
-def test_given_phases_of_unknown_worth_are_not_used():
+def test_phases_stated_as_unknown_are_not_used():
     model, data = files("blind_03")
     one, other = (predictions_of(model, without_phases(data, seed=k)).chosen.states for k in (0, 1))
     for name, a, b in zip(one._fields, one, other, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, err_msg=name)
 
 
-def sizes(noise):
+def magnitudes(noise):
     """One part of every state, a harmonic."""
     n = len(noise)
     nowhere = np.zeros((1, 3), dtype=complex)
-    return Sizes(np.ones((n, 1), complex), nowhere, noise[:, None], np.ones((n, 1), bool))
+    return Magnitudes(np.ones((n, 1), complex), nowhere, noise[:, None], np.ones((n, 1), bool))
 
 
 def test_small_harmonics_are_expected_as_noise_makes_them():
@@ -106,7 +106,7 @@ def test_small_harmonics_are_expected_as_noise_makes_them():
     rng, n, noise = np.random.default_rng(0), 400_000, 1.3
     errors = (rng.normal(size=(n, 1)) + 1j * rng.normal(size=(n, 1))) * noise / np.sqrt(2)
     measured = np.abs(true + errors)
-    found = sizes(np.full(5, noise))
+    found = magnitudes(np.full(5, noise))
     columns = np.zeros((1, 5, 2))
     columns[0, :, 0] = true - 1
     slopes = np.zeros((1, 5, 2, 1))
@@ -118,11 +118,11 @@ def test_small_harmonics_are_expected_as_noise_makes_them():
     np.testing.assert_allclose(std, measured.std(axis=0), rtol=0.01)
     step = 1e-6
     further = found.compared(columns + step, slopes)[0][0, :, 0]
-    # A step along both parts: that across the phasor changes no size to first order.
+    # A step in both parts: that normal to the phasor changes no magnitude to first order.
     np.testing.assert_allclose((further - expected[0, :, 0]) / step, slope[0, :, 0, 0], atol=1e-5)
 
 
-def test_errors_are_passed_on_to_sizes():
+def test_errors_are_propagated_to_magnitudes():
     model, data = files("blind_03")
     predictions = predictions_of(model, without_phases(data))
     group = predictions.group
@@ -136,18 +136,18 @@ def test_errors_are_passed_on_to_sizes():
     )
     ends = [alone(p).columns[0, :, 0] for p in (louder, softer)]
     slope = (ends[0] - ends[1]) / (2 * step)
-    # The force's size grows with the velocity, and more where the stiffness is cubic.
+    # The force grows with the velocity, and more where the stiffness is cubic.
     # Central differences are off by the square of the step.
     np.testing.assert_allclose(slopes[:, 0, 1], slope, rtol=1e-4, atol=1e-4)
     # Differences over a step of 2.5e-5 are off by as much.
     np.testing.assert_allclose(slopes[:, 0, 0], -1.0, atol=4e-5)
-    # A turn by so little makes parts shorter by half its square; harmonic 3 turns by three of it.
+    # Rotation by ε shortens parts by ε²/2; harmonic 3 rotates by 3ε.
     np.testing.assert_allclose(slopes[:, :2, 2], 0.0, atol=4e-5)
     np.testing.assert_allclose(slopes[:, 2:, 2], 0.0, atol=9 * 4e-5)
 
 
 def test_the_hidden_damping_is_the_first_law_without_phases():
-    """Sizes alone determine less: the law need not be certain, and may be drawn."""
+    """Magnitudes determine less: the law may be uncertain, or drawn."""
     found, key = stripped("blind_12")
     (truth,) = key["effects"]
     assert found.verdict.is_answer
@@ -166,16 +166,14 @@ def test_the_hidden_damping_is_the_first_law_without_phases():
     assert found.force_misfit.after.shape == (36, 2)
     assert np.isfinite(found.force_misfit.after[:, 0]).all()
     assert np.isnan(found.force_misfit.after[:, 1]).all()
-    # The velocities are put where the answer has them: that is where they were measured.
+    # The phases set to those of the answer are the measured ones.
     measured = np.angle(np.asarray(files("blind_12")[1].velocity)[:, 0])
     model, data = files("blind_12")
     misfit = weighted_misfit(predictions_of(model, without_phases(data)))
     one = candidate(truth, scales_of(misfit.predictions))
     fit = fit_effect(misfit, one._replace(starts=((value,),)))
-    turned = np.angle(
-        np.asarray(at_phases_of(misfit, fit).predictions.chosen.states.velocity)[:, 0]
-    )
-    assert np.degrees(np.abs(turned - measured)).max() < 4  # 0.7° of noise, and the model's own
+    phase = np.angle(np.asarray(at_phases_of(misfit, fit).predictions.chosen.states.velocity)[:, 0])
+    assert np.degrees(np.abs(phase - measured)).max() < 4  # 0.7° of noise, and the model's own
 
 
 @pytest.mark.long
@@ -205,19 +203,19 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
         writer = csv.DictWriter(file, [*kept, "velocity_m_s"], extrasaction="ignore")
         writer.writeheader()
         for row in rows:
-            size = np.hypot(float(row["velocity_re_m_s"]), float(row["velocity_im_m_s"]))
-            writer.writerow(row | {"velocity_m_s": repr(float(size))})
+            speed = np.hypot(float(row["velocity_re_m_s"]), float(row["velocity_im_m_s"]))
+            writer.writerow(row | {"velocity_m_s": repr(float(speed))})
     out = tmp_path / "out"
     words = ["diagnose", table, "--model", HERE / "blind" / "blind_03.toml", "--out", out]
     done = CliRunner().invoke(app, [str(word) for word in words])
     assert done.exit_code == 0, done.output
-    told = json.loads((out / "diagnosis.json").read_text())
-    assert told["verdict"] == "none"
-    assert told["effects"] == []
-    assert told["gap"]["after"] == pytest.approx(1.0, abs=0.2)
-    limits = told["detection_limits"]
-    # Errors of phase do not show without phases. Other harmonics turn with the fundamental, so that
-    # nothing is seen of what they alone tell; a preload is looked for only with another effect.
+    written = json.loads((out / "diagnosis.json").read_text())
+    assert written["verdict"] == "none"
+    assert written["effects"] == []
+    assert written["gap"]["after"] == pytest.approx(1.0, abs=0.2)
+    limits = written["detection_limits"]
+    # Without phases, phase errors are invisible, and so are effects that only show in harmonics,
+    # whose phases are relative to the fundamental; a preload is searched with other effects only.
     unlimited = {
         *("sensor_phase_error", "close_mode", "internal_resonance_1_2", "internal_resonance_1_3"),
         *("force_harmonics", "mode_shape_change", "static_preload"),
@@ -225,10 +223,10 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
     assert {name.split(".")[0] for name in limits} == set(EFFECTS) - unlimited
     assert all(0 < limit < np.inf for limit in limits.values())
     wanted = Fact("phases_unknown", n_states=50, of_states=50), Fact("harmonics_without_phase")
-    assert set(map(str, wanted)) <= set(told["notes"])
+    assert set(map(str, wanted)) <= set(written["notes"])
     assert (out / "residuals.png").stat().st_size > 10_000
-    # An effect as large as its limit moves χ² by what detection asks for, and by no more than twice
-    # and a bit: the readings leave phases and the modal mass open, which χ² does not.
+    # An effect at its limit changes χ² by the detection threshold to 2.5 times as much: in the
+    # readings phases and the modal mass are free, in χ² they are not.
     model, data = files("blind_03")
     misfit = weighted_misfit(predictions_of(model, without_phases(data)))
     for kind in ("linear_damping_change", "linear_frequency_shift", "cubic_stiffness"):
@@ -254,7 +252,7 @@ def test_amplitudes_count_once():
     model, data = linear_model(), without_phases(balanced(quadratic))
     misfit = weighted_misfit(predictions_of(model, data))
     assert misfit.n_rows == data.n_states
-    assert sizes_of(misfit.predictions.chosen).alone.all()
+    assert magnitudes_of(misfit.predictions.chosen).alone.all()
     few = balanced(quadratic, levels=1, per_level=11)
     sj.diagnose_model(model, few)
     with pytest.raises(ValueError, match="or 12 where phases are unknown, not 11"):
@@ -270,7 +268,7 @@ def test_amplitudes_count_once():
         inverse_force,
     ],
 )
-def test_what_needs_phases_says_so(verb):
+def test_functions_that_need_phases_refuse_data_without(verb):
     data = without_phases(balanced(quadratic), slice(0, 2))
     with pytest.raises(
         ValueError, match=r"needs the phases .* 2 of 45 .*`velocity_m_s`.*`snrmjax diagnose`"

@@ -14,12 +14,12 @@ OMEGA, ZETA, NOISE = 300.0, 0.01, 1e-4
 LABELS = ("sensor_phase_error.phase_deg", "iwan_microslip.coefficient", "iwan_microslip.exponent")
 
 
-def test_slopes_are_those_of_differences_and_the_way_back_is_the_way_in():
+def test_slopes_are_those_of_differences_and_outward_inverts_inward():
     law = coordinates(LABELS, 2e-4)
     values = np.array([3.0, 8e5, 2.1])
 
     def seen(values):
-        """Something with a slope by every parameter."""
+        """A function with a derivative by every parameter."""
         phase, c, p = values
         return np.array([np.sin(phase) + c * 1e-4 ** (p - 1), c * p * 1e-6, phase * p])
 
@@ -70,8 +70,8 @@ def test_a_law_is_found_along_the_narrow_valley_of_precise_data():
     at = float(scales_of(predictions).amplitude)
 
     def left(point):
-        size, p = point
-        values = np.array([[size * at ** (1 - p), p]])
+        stiffness, p = point
+        values = np.array([[stiffness * at ** (1 - p), p]])
         return misfit.noise.decorrelated(misfit.evaluated(labels, values)[0][0])
 
     c, p = one.starts[0]

@@ -1,4 +1,4 @@
-"""Hypotheses compared with records that are corrected for errors: levels far off, steep curves."""
+"""Hypotheses compared with corrected records: large level errors, steep curves."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ GAIN, PHASE = np.array([0.15, -0.1, 0.08, -0.12, 0.05]), np.radians([3.0, -2.0, 
 
 
 def hardening(stiffening, gain=GAIN, phase=PHASE, stiffer=0 * GAIN, noise=0.0):
-    """States of one harmonic whose ω̃² grows by a share at the top level, and levels' errors.
+    """Single-harmonic states with ω̃² larger by a fraction at the top level, and level errors.
 
     `stiffer` are relative deviations of the levels' linear stiffness; dashpots are all the same.
     The force that a motion needs is known in closed form: nothing is solved.
@@ -63,24 +63,24 @@ def compared(data, **settings):
 
 
 @pytest.mark.long
-def test_large_errors_of_levels_beside_a_steep_curve_are_found():
+def test_large_level_errors_on_a_steep_curve_are_found():
     data = hardening(0.3)  # 75 bandwidths
     misfit = weighted_misfit(at_reference(with_reference(compared(data)), data))
     fit = fit_effect(misfit, candidate("cubic_stiffness", scales_of(misfit.predictions)))
     misfit, fit = refined(data, misfit, fit)
-    # Without noise only the levels' errors cost: (0.15/0.15)² …, and what they have in common.
+    # Without noise χ² is only that of the level errors: (0.15/0.15)² …
     assert fit.chi_square < 12.0
     added = likely_errors(misfit, fit.rows)
     level = np.asarray(misfit.predictions.chosen.states.level)
     gain = np.array([added[level == k, 1].mean() for k in range(5)])
     phase = np.array([added[level == k, 2].mean() for k in range(5)])
-    # A gain that all share is one with the coefficient and the force: only differences are seen.
+    # A common gain cannot be separated from coefficient and force: compare differences.
     np.testing.assert_allclose(gain - gain.mean(), -(GAIN - GAIN.mean()), atol=0.004)
     np.testing.assert_allclose(phase, -PHASE, atol=0.003)
 
 
-def test_a_gain_that_all_levels_share_is_theirs_as_long_as_theirs_are_as_large():
-    """What no difference between levels shows: 10 % of 15 % (1σ), beside curves that are steep."""
+def test_a_common_gain_is_a_level_error_as_long_as_level_errors_are_as_large():
+    """A common gain of 10 %, with level errors of 15 % (1σ) and steep curves."""
     data = hardening(0.3, gain=GAIN + 0.1, noise=NOISE)
     kinds = ("cubic_stiffness", "sensor_gain_error", "force_gain_error", "added_mass")
     found = named_parts(compared(data), data, kinds).naming
@@ -102,12 +102,12 @@ def test_errors_move_the_force_as_the_true_curve_does():
     needed = squared - omega**2 + 2j * RATIO * OMEGA * omega
     wanted = 1 + 2 * (squared - OMEGA**2) / needed
     off = np.abs(reference.by_velocity - wanted) / np.abs(wanted)
-    # A gain that levels share is not known: its share of the amplitude counts twice.
+    # The common gain of the levels is unknown: its effect on the amplitude counts twice.
     assert np.median(off) < 0.1
-    # Phases of levels, up to 3°, do not turn it. At the largest level, the first, curves end: there
-    # it alone says what its phase and what the damping is.
-    turned = np.angle(reference.by_velocity / wanted)
-    middle = np.array([np.median(turned[level == k]) for k in range(1, 5)])
+    # Level phases, up to 3°, do not rotate it. At the end of the curves, the largest level (first),
+    # phase and damping depend on this level alone.
+    rotation = np.angle(reference.by_velocity / wanted)
+    middle = np.array([np.median(rotation[level == k]) for k in range(1, 5)])
     assert np.max(np.abs(middle)) < np.radians(1.0)
 
 
@@ -123,14 +123,14 @@ def test_errors_do_not_explain_an_answer_that_is_wrong(kind):
 
 
 @pytest.mark.parametrize(
-    "sizes",
+    "level_errors",
     [
         {"level_gain_std": 0.15, "level_phase_std": 0.05, "level_frequency_std": 0.01 * OMEGA},
         {},
     ],
 )
-def test_a_linear_structure_with_errors_of_levels_lacks_nothing(sizes):
-    model = linear_model(damping=RATIO, damping_std=0.2 * RATIO, **sizes)
+def test_a_linear_structure_with_errors_of_levels_lacks_nothing(level_errors):
+    model = linear_model(damping=RATIO, damping_std=0.2 * RATIO, **level_errors)
     stiffer = 0.02 * np.array([1.0, -0.7, 0.4, -1.2, 0.3])
     found = sj.diagnose_model(model, hardening(0.0, stiffer=stiffer, noise=NOISE))
     assert found.verdict == "none"
@@ -138,22 +138,22 @@ def test_a_linear_structure_with_errors_of_levels_lacks_nothing(sizes):
 
 
 def test_an_error_of_the_only_level_is_no_defect_of_the_instruments():
-    """Nobody states how far phases of a level may be off: 0.25° is less than they differ by."""
+    """Level phase errors are unstated: 0.25° is less than levels usually differ by."""
     data = hardening(0.0, gain=[0.0], phase=[np.radians(-0.25)], stiffer=[0.0], noise=5e-4)
     error = 5e-4 * np.abs(np.asarray(data.velocity))
     data = dataclasses.replace(data, velocity_std=error, phase_std=np.full_like(error, 5e-4))
-    sizes = {
+    level_errors = {
         "level_gain_std": 0.01,
         "level_frequency_std": 1e-3 * OMEGA,
         "level_damping_std": 0.05 * RATIO,
     }
-    model = linear_model(damping=RATIO, damping_std=0.2 * RATIO, **sizes)
+    model = linear_model(damping=RATIO, damping_std=0.2 * RATIO, **level_errors)
     found = sj.diagnose_model(model, data)
     assert found.verdict == "none"
     assert found.gap.after < 1.3  # the level's own phase counts among its errors
 
 
-def test_records_as_they_are_carry_nothing_over():
+def test_uncorrected_records_have_no_offset():
     data = hardening(0.05)
     predictions = with_reference(compared(data))
     there = weighted_misfit(at_reference(predictions, data))
@@ -165,7 +165,7 @@ def test_records_as_they_are_carry_nothing_over():
     np.testing.assert_allclose(back.baseline.columns, plain.baseline.columns, rtol=1e-6, atol=1e-9)
 
 
-def test_corrections_turn_harmonics_as_errors_of_time():
+def test_corrections_rotate_harmonics_as_time_shifts():
     data = hardening(0.0)
     n = data.n_states
     harmonics = np.full((n, 1, 2), 0.1 + 0.05j) * np.abs(np.asarray(data.velocity))[:, :, None]
@@ -179,12 +179,12 @@ def test_corrections_turn_harmonics_as_errors_of_time():
     new = with_corrected_records(data, np.arange(n), (0,), added)
     np.testing.assert_allclose(new.velocity, data.velocity * np.exp(0.1 + 0.02j), rtol=1e-12)
     for k, order in enumerate((2, 3)):
-        turned = harmonics[..., k] * np.exp(0.1 + 0.02j * order)
-        np.testing.assert_allclose(new.harmonics[..., k], turned, rtol=1e-12)
+        rotation = harmonics[..., k] * np.exp(0.1 + 0.02j * order)
+        np.testing.assert_allclose(new.harmonics[..., k], rotation, rtol=1e-12)
 
 
 def with_noise_as_harmonics(data, seed=5):
-    """Harmonics 2 and 3 of a linear structure: nothing but noise of the stated size."""
+    """Harmonics 2 and 3 of a linear structure: nothing but noise of the stated level."""
     rng = np.random.default_rng(seed)
     n = data.n_states
     std = 0.005 * np.max(np.abs(data.velocity))
@@ -194,7 +194,7 @@ def with_noise_as_harmonics(data, seed=5):
     )
 
 
-def test_errors_of_levels_pass_on_harmonics_and_not_their_noise():
+def test_level_errors_act_on_harmonics_and_not_on_their_noise():
     """A linear structure has no harmonics, so that no gain and no phase can change them."""
     predictions = predictions_of(
         linear_model(damping=RATIO), with_noise_as_harmonics(hardening(0.0))
@@ -202,13 +202,13 @@ def test_errors_of_levels_pass_on_harmonics_and_not_their_noise():
     by_error, _ = predictions.by_error(predictions.group.values)
     assert by_error.shape[1:] == (6, 3)
     assert np.max(np.abs(by_error[:, :2])) > 0.5
-    # Slopes are differences, whose second order is of the noise: 0.2 at most, times a small step.
+    # Finite differences have a second-order error of the noise: at most 0.2 times a small step.
     np.testing.assert_allclose(by_error[:, 2:], 0.0, atol=2e-5)
 
 
 @pytest.mark.long
-def test_a_gain_beside_levels_that_may_differ_does_not_explain_the_noise_of_harmonics():
-    """Errors of levels as large as −100 % would, and noise far below the stated beside them."""
+def test_a_gain_with_level_errors_does_not_explain_the_noise_of_harmonics():
+    """Level errors as large as −100 % would, and then noise far below the stated."""
     data = hardening(0.0, gain=0 * GAIN + np.log(0.88), phase=0 * PHASE, noise=NOISE)
     found = sj.diagnose_model(
         linear_model(damping=RATIO, damping_std=0.05 * RATIO), with_noise_as_harmonics(data)

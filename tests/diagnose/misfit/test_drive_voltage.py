@@ -18,7 +18,7 @@ GAIN = 0.8  # N/V
 
 
 def driven(data):
-    """The states with the voltage that made their force."""
+    """The states with the drive voltage of their force."""
     return dataclasses.replace(
         data,
         drive=jnp.asarray(data.force) / GAIN,
@@ -37,7 +37,7 @@ def without_phases(data):
 
 
 def check(found):
-    """The damping is found, and the gain by which it is right."""
+    """The damping is identified, with the right gain."""
     assert "quadratic_damping" in found.candidates[0]
     kinds = ("gain_of_drive", "gain_with_effects")
     first, last = (note for note in found.notes if getattr(note, "kind", "") in kinds)
@@ -59,7 +59,7 @@ def test_the_python_verb_takes_a_drive_voltage(of_volts):
 
 
 def test_a_drive_voltage_without_phases_is_diagnosed():
-    """A joint fit would need the phases, and sends to the diagnosis for want of them."""
+    """A joint fit needs the phases; without them it recommends the diagnosis."""
     data = without_phases(driven(balanced(quadratic)))
     with pytest.raises(ValueError, match="snrmjax diagnose"):
         sj.fit_jointly(data, linear_model())
@@ -76,10 +76,10 @@ def test_command_and_verb_agree(tmp_path, of_volts):
     words = ["diagnose", *data_and_model, "--out", tmp_path / "out", "--no-responses"]
     done = CliRunner().invoke(app, [str(word) for word in words])
     assert done.exit_code == 0, done.output
-    told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
-    assert told["effects"] == list(found.effects)
-    assert told["notes"] == [*map(str, found.notes)]
+    written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert written["effects"] == list(found.effects)
+    assert written["notes"] == [*map(str, found.notes)]
     for name, (value, std) in found.parameters.items():
-        # What the file's digits leave.
-        assert told["parameters"][name]["value"] == pytest.approx(value, rel=1e-6)
-        assert told["parameters"][name]["std"] == pytest.approx(std, rel=1e-6)
+        # Rounding in the file.
+        assert written["parameters"][name]["value"] == pytest.approx(value, rel=1e-6)
+        assert written["parameters"][name]["std"] == pytest.approx(std, rel=1e-6)

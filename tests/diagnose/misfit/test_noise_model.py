@@ -42,7 +42,7 @@ def test_products_are_those_of_the_dense_matrix(name):
     assert whole @ whole.T == pytest.approx(ROWS @ solved.T, rel=1e-10, abs=1e-10)
     root = one.decorrelated(np.eye(N))
     assert root @ dense @ root.T == pytest.approx(np.eye(N), abs=1e-7)
-    # Shared errors as unknowns of their own, with priors of unit size.
+    # Shared errors as unknowns of their own, with unit priors.
     stacked = np.concatenate([shared, np.eye(shared.shape[1])])
     aim = np.concatenate([ROWS[0], np.zeros(shared.shape[1])])
     errors = np.linalg.lstsq(stacked, aim)[0]
@@ -56,7 +56,7 @@ def test_rows_given_others_are_those_of_the_normal_distribution(name):
     own = one.of_rows(KEPT).decorrelated(ROWS[0, KEPT])
     square = ROWS[0, KEPT] @ np.linalg.solve(dense[np.ix_(KEPT, KEPT)], ROWS[0, KEPT])
     assert own @ own == pytest.approx(square, rel=1e-10)
-    # The last rows of what Cholesky's factor makes of rows sorted so.
+    # Conditional rows: the last ones after forward substitution with Cholesky factor.
     last = np.argsort(~KEPT, kind="stable")
     lower = np.linalg.cholesky(dense[np.ix_(last, last)])
     left = np.linalg.solve(lower, ROWS[:, last].T)[KEPT.sum() :]

@@ -25,7 +25,7 @@ EVERY = [k if k in QUICK else pytest.param(k, marks=pytest.mark.long) for k in E
 
 @pytest.fixture(scope="module")
 def predictions():
-    """States that a linear model needs two per cent more force for."""
+    """States with two per cent more force than a linear model needs."""
     modes = sj.model.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
     model = dataclasses.replace(sj.model.structure(modes), name="")
     frequency = OMEGA * np.tile(np.linspace(0.98, 1.02, 4), 2)
@@ -37,7 +37,7 @@ def predictions():
 
 
 class SmoothFriction(sj.model.AbstractMemoryless):
-    """f = c tanh(q̇/knee): an effect of a user, who says nothing of what is typical."""
+    """f = c tanh(q̇/knee): a user's effect without typical values."""
 
     kind: ClassVar[str] = "smooth_friction"
     coefficient: Array
@@ -101,20 +101,20 @@ def moderate(kind, scales):
 
 
 @pytest.mark.parametrize("kind", EVERY)
-def test_what_states_miss_is_what_newtons_method_finds(predictions, kind):
+def test_misfits_are_those_of_newtons_method(predictions, kind):
     ours, data = predictions
     values = moderate(kind, scales_of(ours))
-    found = asked(ours, kind, values[None])[0]
+    found = force_misfit(ours, kind, values[None])[0]
     effect = make_effect(kind, dict(zip(effect_parameters(kind), values, strict=True)))
     model = dataclasses.replace(ours.model, effects=(effect,))
     needed = inverse_force(model, data, harmonic_order=HARMONICS)
     assert needed.converged.all()
-    missed = np.asarray(needed.force) / np.asarray(data.force) - 1
+    misfit = np.asarray(needed.force) / np.asarray(data.force) - 1
     # Masing's formula stands for sliders, of which a rule of 48 points makes an error of 1e-4.
     # Steps end below 1e-5.
     tolerance = 1e-4 if kind == "iwan_microslip" else 1e-5
-    change = np.max(np.abs(missed - missed_by(ours)))
-    assert np.max(np.abs(found - missed)) < tolerance * max(change, 1e-3)
+    change = np.max(np.abs(misfit - baseline_misfit(ours)))
+    assert np.max(np.abs(found - misfit)) < tolerance * max(change, 1e-3)
 
 
 @pytest.mark.parametrize("kind", EFFECTS)
@@ -127,42 +127,42 @@ def test_slopes_are_those_of_finite_differences(predictions, kind):
     for k in range(len(labels)):
         step = np.zeros(len(labels))
         step[k] = 1e-3 * (abs(values[k]) or 1.0)
-        up, down = asked(ours, kind, np.stack([values + step, values - step]))
+        up, down = force_misfit(ours, kind, np.stack([values + step, values - step]))
         expected = (up - down) / (2 * step[k])
         found = slopes[:, 0, k] + 1j * slopes[:, 1, k]
         # They carry the baseline's Jacobian: exact for what an effect does by itself.
         assert np.max(np.abs(found - expected)) < 0.03 * np.max(np.abs(expected)) + 1e-12
 
 
-def asked(ours, kind, values):
+def force_misfit(ours, kind, values):
     """Complex force misfits of trials, over the measured force."""
     found = ours.of(ours.group.at(parameter_labels(kind), values))
     return found.columns[..., 0] + 1j * found.columns[..., 1]
 
 
-def missed_by(ours):
+def baseline_misfit(ours):
     """The same of the baseline."""
     group = ours.group
     found = ours.of(group.values[None])
     return found.columns[0, :, 0] + 1j * found.columns[0, :, 1]
 
 
-def test_where_no_motion_ends_a_step_the_way_towards_it_is_the_slope(predictions):
+def test_without_convergence_of_the_second_motion_its_first_step_is_the_slope(predictions):
     ours, _ = predictions
     group, label = ours.group, "cubic_stiffness.coefficient"
     usual = ours.of(group.values[None], [label]).slopes[0, :, :2, 0]
     far = group._replace(unit=1e7 * group.unit)
-    there = group.at([label], 2.5e-4 * far.unit[group.places([label])])
+    there = group.at([label], 2.5e-4 * far.unit[group.indices([label])])
     lost = ~np.isfinite(ours.of(there[None]).columns).all(axis=(0, 2))
     assert lost[4:].all()  # the larger motions
     slopes = (
         dataclasses.replace(ours, group=far).of(group.values[None], [label]).slopes[0, :, :2, 0]
     )
-    # What holds the motion is linear in the coefficient, and so is the first step.
+    # The force of the prescribed motion is linear in the coefficient, and so is the first step.
     np.testing.assert_allclose(slopes[lost], usual[lost], rtol=0, atol=1e-2 * np.abs(usual).max())
 
 
-def test_what_the_model_is_unsure_of_has_slopes_however_small_it_is(predictions):
+def test_uncertain_parameters_have_slopes_however_small_they_are(predictions):
     """A coefficient is 1e-3 of its own 1σ: the slope is that of the force of a cubic spring."""
     _, data = predictions
     linear = sj.model.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
@@ -177,15 +177,15 @@ def test_what_the_model_is_unsure_of_has_slopes_however_small_it_is(predictions)
     np.testing.assert_allclose(slopes[:, 0] + 1j * slopes[:, 1], expected[:, None], rtol=1e-2)
 
 
-def test_shapes_of_ones_own_effect_have_slopes_whatever_their_size(own_friction):
-    """A knee of 3e-4 m/s, of which nothing says that one is no unit for it."""
+def test_shapes_of_a_users_effect_have_slopes_whatever_their_magnitude(own_friction):
+    """A knee of 3e-4 m/s, for which one is no suitable unit."""
     ours, group, labels = own_friction
     values = group.values.copy()
-    places = group.places(labels)
-    values[places] = 0.3 * group.unit[places[0]], 3e-4
+    indices = group.indices(labels)
+    values[indices] = 0.3 * group.unit[indices[0]], 3e-4
     slopes = ours.of(values[None], labels).slopes[0, :, :, 1]
     ends = np.stack([values, values])
-    ends[:, places[1]] += np.array([1e-3, -1e-3]) * 3e-4
+    ends[:, indices[1]] += np.array([1e-3, -1e-3]) * 3e-4
     columns = ours.of(ends).columns
     expected = (columns[0] - columns[1]) / (2e-3 * 3e-4)
     np.testing.assert_allclose(slopes, expected, atol=0.03 * np.abs(expected).max())

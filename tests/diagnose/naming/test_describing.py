@@ -13,7 +13,7 @@ from snrmjax.diagnose.naming.laws import LAWS
 X = np.array([0.2, 0.45, 0.8, 1.0])
 OMEGA = np.array([0.97, 1.0, 1.02, 1.05])  # over the natural frequency
 RATIO = 0.01
-READ = SimpleNamespace(
+READINGS = SimpleNamespace(
     relative_amplitude=X,
     relative_frequency=OMEGA,
     damping_ratio=RATIO,
@@ -27,7 +27,7 @@ def fundamental(force, x):
     return 2 * np.mean(force(x * np.cos(t), t) * np.exp(-1j * t)) / x
 
 
-def test_a_gap_is_that_of_its_force():
+def test_a_gap_has_the_fundamental_of_its_force():
     def force(q, _):
         return np.sign(q) * np.maximum(np.abs(q) - 0.3, 0.0)
 
@@ -54,7 +54,7 @@ def test_a_stop_moves_the_mean_until_the_contact_balances_it(stiffness):
     np.testing.assert_allclose(describing.stop(X, 0.3, stiffness), wanted, atol=1e-5)
 
 
-def test_a_slider_is_that_of_its_hysteresis():
+def test_a_slider_has_the_fundamental_of_its_hysteresis():
     """A block behind a spring of stiffness 1, dragged where the stretch exceeds the slip."""
     slip, wanted = 0.3, []
     for x in X:
@@ -62,7 +62,7 @@ def test_a_slider_is_that_of_its_hysteresis():
         block, force = 0.0, np.empty_like(q)
         for k, at in enumerate(q):
             block = min(max(block, at - slip), at + slip)
-            force[k] = -block  # beside the stuck stiffness, which is the linear mode's
+            force[k] = -block  # less the stuck stiffness, which is part of the linear mode
         t = np.arange(40000) * 2 * np.pi / 40000
         wanted.append(2 * np.mean(force[40000:] * np.exp(-1j * t)) / x)
     lost, damping = describing.slider(X, slip)
@@ -70,7 +70,7 @@ def test_a_slider_is_that_of_its_hysteresis():
 
 
 @pytest.mark.parametrize("exponent", [1.3, 2.0, 2.7])
-def test_microslip_loses_what_the_literature_says(exponent):
+def test_microslip_loses_energy_as_published(exponent):
     """Damping 4(p − 1)/(π(p + 1)) of Masing's loop on a power law (Segalman 2005)."""
     lost, damping = describing.masing(exponent, samples=4000)
     assert damping == pytest.approx(4 * (exponent - 1) / (np.pi * (exponent + 1)), rel=1e-5)
@@ -141,15 +141,15 @@ def iwan(exponent, n=400):
         ("iwan_microslip", (2.0,), iwan(2.0), 5e-3),
     ],
 )
-def test_other_harmonics_are_to_the_fundamental_as_those_of_the_force(kind, shape, force, within):
+def test_ratios_of_harmonics_are_those_of_the_force(kind, shape, force, within):
     law = LAWS[kind]
     first, *others = harmonics(force)
-    own = law.change(READ, *shape)
+    own = law.change(READINGS, *shape)
     seen = np.abs(own) > 1e-9
     scale = np.median(np.real(own[seen] / first[seen]))
     np.testing.assert_allclose(own, scale * first, atol=within * scale * np.max(np.abs(first)))
     for order, wanted in zip((2, 3), others, strict=True):
-        found = law.higher(READ, SimpleNamespace(order=order), *shape)
+        found = law.higher(READINGS, SimpleNamespace(order=order), *shape)
         np.testing.assert_allclose(
             found, scale * wanted, atol=within * scale * np.max(np.abs(first)), err_msg=str(order)
         )
@@ -190,8 +190,8 @@ def test_an_even_spring_has_the_second_harmonic_of_its_own_motion(kind, strength
             for x, omega in zip(X, OMEGA, strict=True)
         ]
     ).T
-    # What the further harmonics change is of the next order of the strength.
-    np.testing.assert_allclose(law.change(READ, *shape).real, wanted[0].real, rtol=0.06)
-    second = law.higher(READ, SimpleNamespace(order=2), *shape)
+    # Further harmonics act at the next order of the strength.
+    np.testing.assert_allclose(law.change(READINGS, *shape).real, wanted[0].real, rtol=0.06)
+    second = law.higher(READINGS, SimpleNamespace(order=2), *shape)
     np.testing.assert_allclose(second, wanted[1], rtol=0.06)
-    assert not np.any(law.higher(READ, SimpleNamespace(order=3), *shape))
+    assert not np.any(law.higher(READINGS, SimpleNamespace(order=3), *shape))

@@ -7,7 +7,7 @@ from truths.phased_states import OMEGA, linear_motion, named, nothing, readings,
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming import hypotheses, parts
 from snrmjax.diagnose.naming.columns import hypothesis_columns
-from snrmjax.diagnose.naming.evidence import sizes_of_remainders
+from snrmjax.diagnose.naming.evidence import remainder_stds
 from snrmjax.diagnose.naming.hypotheses import hypotheses_of
 from snrmjax.diagnose.naming.readings import readings_of
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
@@ -19,10 +19,12 @@ LAWS = ("cubic_stiffness", "quintic_stiffness", "quadratic_damping", "coulomb_fr
 def test_an_evidence_is_that_of_the_dense_gaussian():
     read = readings(lambda x: 0.02 * x**2, nothing)
     problem = problem_of(read, hypothesis_columns(read, LAWS), 1.0)
-    sizes = (float(priors.REMAINDERS[4]), 0.0)
-    cells = {c.columns: c for c in hypotheses._weighed(problem, reach=1e6)[0] if c.sizes == sizes}
+    stds = (float(priors.REMAINDERS[4]), 0.0)
+    cells = {
+        c.columns: c for c in hypotheses._compared(problem, reach=1e6)[0] if c.remainder_std == stds
+    }
     (block,) = problem.blocks
-    base = block.design * np.sqrt(block.variances(sizes))
+    base = block.design * np.sqrt(block.variances(stds))
     noise = np.eye(len(read.rows)) + base @ base.T
 
     def log_density(covariance):
@@ -35,7 +37,7 @@ def test_an_evidence_is_that_of_the_dense_gaussian():
     each = [log_density(noise + s**2 * column @ column.T) for s in priors.STRENGTHS]
     alone = log_density(noise)
     wanted = np.logaddexp.reduce(each) - np.log(len(each)) - alone
-    wanted += np.log(priors.SIZES[1] / len(LAWS)) - np.log(priors.SIZES[0])
+    wanted += np.log(priors.EFFECT_COUNTS[1] / len(LAWS)) - np.log(priors.EFFECT_COUNTS[0])
     found = cells[0,].log_evidence - cells[()].log_evidence
     assert found == pytest.approx(wanted, abs=1e-4)
 
@@ -81,7 +83,7 @@ def test_a_law_with_a_fifth_from_elsewhere_is_listed_with_its_fraction_and_the_r
     assert part.remainder.significant
 
 
-def test_what_no_law_follows_is_drawn():
+def test_a_change_that_no_law_follows_is_drawn():
     def waves(x):
         return 0.02 * np.sin(5 * np.log(x))
 
@@ -106,14 +108,14 @@ def test_the_force_of_a_remainder_has_its_describing_function():
         assert stiffness == pytest.approx(left.value[k], abs=0.05 * np.ptp(left.value))
 
 
-def test_pairs_that_are_left_out_could_not_count():
+def test_pairs_left_out_are_irrelevant():
     """With and without the bound on pairs the probable hypotheses are the same."""
     read = readings(lambda x: 0.02 * x**2, lambda x, om: 0.004 * x * om)
     problem = problem_of(read, hypothesis_columns(read, LAWS), 1.0)
     first = hypotheses_of(problem)
-    few = sizes_of_remainders(2)
+    few = remainder_stds(2)
     for one in [c for c in first if len(c.columns) == 2][:5]:
-        assert set(one.sizes) <= set(few)
+        assert set(one.remainder_std) <= set(few)
     top = first[0]
     assert {problem.columns[k].kind for k in top.columns} == {
         "cubic_stiffness",
@@ -134,7 +136,7 @@ def test_readings_do_not_change_with_units_of_force():
 
 
 def test_three_laws_together_are_found():
-    """The third goes on from the best pair; a shift of the linear mode is no remainder's."""
+    """The third extends the best pair; a shift of the linear mode is no remainder."""
     read = readings(lambda x: 0.02 + 0.02 * x**2, lambda x, om: 0.01 * x * om, levels=8)
     kinds = ("cubic_stiffness", "quintic_stiffness", "quadratic_damping", "linear_frequency_shift")
     problem, cells = hypotheses.best_hypotheses(read, kinds)
@@ -143,8 +145,8 @@ def test_three_laws_together_are_found():
 
 
 @pytest.mark.parametrize("power", [0.6, 1.0])
-def test_the_fraction_of_a_law_is_right_beside_another_power_of_the_amplitude(power):
-    """What a law explains is one less the rest over the whole change, by standard deviations."""
+def test_the_fraction_of_a_law_is_right_with_another_power_of_the_amplitude(power):
+    """The fraction is one less the standard deviation of the rest over that of the change."""
     law, other = 0.02, 0.005
 
     def stiffness(x):
@@ -169,7 +171,7 @@ def test_the_fraction_of_a_law_is_right_beside_another_power_of_the_amplitude(po
     ],
 )
 def test_a_law_is_named_where_it_explains_most(fraction, with_a_rest, with_noise):
-    """80 % and at least half; beside noise at least half and perhaps 80 %."""
+    """80 % and at least half; over noise at least half and possibly 80 %."""
     explained = parts.Explained(*fraction)
     assert explained.is_most(rest_is_noise=False) is with_a_rest
     assert explained.is_most(rest_is_noise=True) is with_noise
@@ -180,14 +182,14 @@ def test_odds_of_a_remainder_are_those_of_the_dense_gaussian():
     problem = problem_of(read, hypothesis_columns(read, LAWS), 1.0)
     (block,) = problem.blocks
 
-    def log_density(sizes):
-        base = block.design * np.sqrt(block.variances(sizes))
+    def log_density(stds):
+        base = block.design * np.sqrt(block.variances(stds))
         law = block.laws[:, [0]]
         root = np.linalg.cholesky(np.eye(len(read.rows)) + base @ base.T + law @ law.T)
         white = np.linalg.solve(root, read.rows)
         return -0.5 * white @ white - np.sum(np.log(np.diag(root)))
 
-    sizes = (float(priors.REMAINDERS[5]), 0.0)
-    cell = Cell(0.0, (0,), sizes)
+    stds = (float(priors.REMAINDERS[5]), 0.0)
+    cell = Cell(0.0, (0,), stds)
     odds = parts.log_odds_of_remainder(problem, cell, solved(problem, cell), "stiffness")
-    assert odds == pytest.approx(log_density(sizes) - log_density((0.0, 0.0)), rel=1e-6)
+    assert odds == pytest.approx(log_density(stds) - log_density((0.0, 0.0)), rel=1e-6)

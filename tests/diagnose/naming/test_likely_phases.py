@@ -1,4 +1,4 @@
-"""Phases of states whose sizes alone are known, against states whose dynamic stiffness is exact."""
+"""Estimated phases of states with known magnitudes, against an exact dynamic stiffness."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from truths.phased_states import OMEGA, RATIO, dynamic, nothing, states_of
 from snrmjax.diagnose.naming.phases import likely_dynamic_stiffness
 
 
-def hardening(size):
-    return lambda x: size * x**2
+def hardening(strength):
+    return lambda x: strength * x**2
 
 
 def friction(x, omega):
@@ -27,12 +27,12 @@ def friction(x, omega):
         (hardening(0.02), friction, 4.0),
     ],
 )
-def test_sizes_of_states_at_several_frequencies_tell_their_phases(stiffness, damping, degrees):
+def test_magnitudes_at_several_frequencies_determine_the_phases(stiffness, damping, degrees):
     states = states_of(stiffness, damping, noise=0.0)
     x, omega = states.amplitude / states.amplitude.max(), states.frequency
     squared = OMEGA**2 * (1 + stiffness(x))
     exact = squared - omega**2 + 1j * omega * OMEGA * (2 * RATIO + damping(x, omega / OMEGA))
-    # As the forces of these states have it.
+    # The states have this dynamic stiffness.
     np.testing.assert_allclose(np.abs(exact), states.force * states.constant / states.amplitude)
     found = likely_dynamic_stiffness(np.abs(exact), dynamic(omega), states.amplitude, OMEGA)
     np.testing.assert_allclose(np.abs(found), np.abs(exact), rtol=1e-12)
@@ -40,12 +40,12 @@ def test_sizes_of_states_at_several_frequencies_tell_their_phases(stiffness, dam
     assert np.sqrt(np.mean(off**2)) < degrees
 
 
-def test_noise_of_the_sizes_is_no_phase_far_off():
+def test_noise_of_the_magnitudes_makes_small_phase_errors():
     states = states_of(hardening(0.02), nothing, noise=5e-3)
     omega = states.frequency
     x = states.amplitude / states.amplitude.max()
     exact = OMEGA**2 * (1 + 0.02 * x**2) - omega**2 + 2j * RATIO * OMEGA * omega
-    size = states.force * states.constant / states.amplitude
-    found = likely_dynamic_stiffness(size, dynamic(omega), states.amplitude, OMEGA)
+    magnitude = states.force * states.constant / states.amplitude
+    found = likely_dynamic_stiffness(magnitude, dynamic(omega), states.amplitude, OMEGA)
     off = np.degrees(np.abs(np.angle(found / exact)))
     assert np.median(off) < 3

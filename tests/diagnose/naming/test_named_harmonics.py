@@ -1,4 +1,4 @@
-"""Laws named by other harmonics that were recorded, and how strong a law must be to be found."""
+"""Laws named by recorded harmonics, and detection limits."""
 
 import functools
 
@@ -17,19 +17,19 @@ def recorded(second=nothing, third=nothing, exciter=(0.0, 0.0), seed=1):
     """Velocities of harmonics 2 and 3 where the force on the mode has these.
 
     Arguments: harmonics of the internal force over ω₀² and the amplitude, as functions of the
-    amplitude over the largest, of a motion x cos t; `exciter`: the force's own, over its size.
+    amplitude over the largest, of a motion x cos t; `exciter`: the force's own, over its first.
     """
 
     def made(states):
         rng, omega = np.random.default_rng(seed), states.frequency
         motion = states.velocity / (1j * omega * SHAPE)
-        size, turn = np.abs(motion), motion / np.abs(motion)
+        amplitude, rotation = np.abs(motion), motion / np.abs(motion)
         x = states.amplitude / states.amplitude.max()
         velocity, forced = [], []
         for order, fraction, own in zip(ORDERS, (second, third), exciter, strict=True):
             answer = 1j * order * omega * SHAPE / dynamic(order * omega)
             forced.append(answer * SHAPE * states.force)
-            internal = OMEGA**2 * fraction(x) * size * turn**order
+            internal = OMEGA**2 * fraction(x) * amplitude * rotation**order
             noise = NOISE * (rng.normal(size=(2, len(x))).T @ [1.0, 1j])
             velocity.append(-answer * internal + own * forced[-1] + noise)
         std = np.full((len(x), 2), NOISE)
@@ -62,17 +62,17 @@ def test_a_stiffness_that_grows_as_the_square_without_a_third_harmonic_is_no_cub
 
 
 @pytest.mark.parametrize("exciter", [(0.01, 0.0), (0.0, -0.02), (0.02, 0.01)])
-def test_harmonics_of_the_exciter_are_found_with_their_sizes(exciter):
+def test_harmonics_of_the_exciter_are_found_with_their_amplitudes(exciter):
     _, found = named(nothing, nothing, recorded(exciter=exciter))
     parts = by_part(found)
     assert parts["stiffness"].verdict == parts["damping"].verdict == "none"
-    for name, size in zip(("second", "third"), exciter, strict=True):
+    for name, amplitude in zip(("second", "third"), exciter, strict=True):
         order = ORDERS[name == "third"]
-        assert parts[f"harmonic_{order}"].effects == (("force_harmonics",) if size else ())
-        if size:
+        assert parts[f"harmonic_{order}"].effects == (("force_harmonics",) if amplitude else ())
+        if amplitude:
             value, std = found.parameters[f"force_harmonics.{name}"]
-            assert value == pytest.approx(size, rel=0.05)
-            assert abs(value - size) < 4 * std
+            assert value == pytest.approx(amplitude, rel=0.05)
+            assert abs(value - amplitude) < 4 * std
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -109,14 +109,12 @@ def limits(noise):
         ("quadratic_damping.coefficient", lambda c: 8 / (3 * np.pi) * c * 1e-3 / SHAPE),
     ],
 )
-def test_what_is_three_times_its_limit_is_found_and_a_tenth_of_it_is_not(
-    label, change, noise, times, seen
-):
-    size, kind = change(times * limits(noise)[label]), label.partition(".")[0]
+def test_three_times_the_limit_is_found_and_a_tenth_of_it_is_not(label, change, noise, times, seen):
+    strength, kind = change(times * limits(noise)[label]), label.partition(".")[0]
     spring = kind == "cubic_stiffness"
     _, found = named(
-        (lambda x: size * x**2) if spring else nothing,
-        nothing if spring else (lambda x, omega: size * x * omega),
+        (lambda x: strength * x**2) if spring else nothing,
+        nothing if spring else (lambda x, omega: strength * x * omega),
         **{"noise": noise, "seed": 3},
     )
     candidates = {one for group in found.candidates for one in group}

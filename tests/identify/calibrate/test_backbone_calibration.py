@@ -1,4 +1,4 @@
-"""Numbers of a structure from its backbone, against closed forms and SciPy's least squares."""
+"""Parameters of a structure from its backbone, against closed forms and SciPy's least squares."""
 
 import dataclasses
 
@@ -30,8 +30,8 @@ def closed_form(velocity, omega, cubic):
 def points(frequency_std=None, velocity_std=None, seed=0):
     noise = np.random.default_rng(seed).normal(size=VELOCITY.size)
     std = 1e-3 * np.ones(VELOCITY.size)
-    told = closed_form(VELOCITY, OMEGA, CUBIC) + noise * std
-    return sj.identify.MeasuredBackbone(VELOCITY, told, frequency_std, velocity_std)
+    measured = closed_form(VELOCITY, OMEGA, CUBIC) + noise * std
+    return sj.identify.MeasuredBackbone(VELOCITY, measured, frequency_std, velocity_std)
 
 
 def calibrated(measured, **settings):
@@ -44,43 +44,41 @@ def calibrated(measured, **settings):
 def test_values_and_covariance_are_those_of_scipy(stated):
     std = 1e-3 * np.ones(VELOCITY.size) if stated else None
     measured = points(std)
-    found = calibrated(measured)
+    fit = calibrated(measured)
     values, covariance = curve_fit(
         closed_form, VELOCITY, measured.frequency, [2.5, 1.0], std, absolute_sigma=stated
     )
-    assert found.converged
+    assert fit.converged
     # The sum of squares settles to 1e-6: values to a thousandth of 1σ.
-    assert np.all(np.abs(found.values - values) < 2e-3 * found.std)
+    assert np.all(np.abs(fit.values - values) < 2e-3 * fit.std)
     # SciPy's derivatives are differences of 1e-8.
-    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-3)
-    np.testing.assert_allclose(found.fitted, closed_form(VELOCITY, *found.values), rtol=1e-10)
-    assert found.to_xarray().sizes["parameter"] == 2
+    np.testing.assert_allclose(fit.covariance, covariance, rtol=1e-3)
+    np.testing.assert_allclose(fit.fitted, closed_form(VELOCITY, *fit.values), rtol=1e-10)
+    assert fit.to_xarray().sizes["parameter"] == 2
 
 
-def test_an_error_of_velocity_counts_by_the_slope():
+def test_velocity_errors_are_weighted_by_the_slope():
     across = 0.01 * VELOCITY
-    found = calibrated(points(1e-3 * np.ones(VELOCITY.size), across))
+    fit = calibrated(points(1e-3 * np.ones(VELOCITY.size), across))
     step = 1e-6
-    slope = closed_form(VELOCITY + step, *found.values) - closed_form(
-        VELOCITY - step, *found.values
-    )
+    slope = closed_form(VELOCITY + step, *fit.values) - closed_form(VELOCITY - step, *fit.values)
     sigma = np.hypot(1e-3, slope / (2 * step) * across)
-    told = found.measured.frequency
-    np.testing.assert_allclose(found.residuals, (told - found.fitted) / sigma, rtol=1e-3, atol=1e-6)
+    measured = fit.measured.frequency
+    np.testing.assert_allclose(fit.residuals, (measured - fit.fitted) / sigma, rtol=1e-3, atol=1e-6)
 
 
-def test_a_prior_takes_the_place_of_what_the_backbone_leaves_open():
-    velocity = np.full(9, 3.0)  # one place of the backbone cannot tell two numbers
+def test_a_prior_fixes_what_the_backbone_does_not_determine():
+    velocity = np.full(9, 3.0)  # one point of the backbone cannot determine two parameters
     one = sj.identify.MeasuredBackbone(
         velocity, closed_form(velocity, OMEGA, CUBIC), 1e-3 * np.ones(9)
     )
-    found = calibrated(one, start={"omega": 2.9, "cubic": CUBIC}, prior_std={"cubic": 0.1})
-    # At the prior's own value the point is met exactly, and the prior's error is that of the value.
-    np.testing.assert_allclose(found.values, [OMEGA, CUBIC], rtol=1e-4)
-    assert found.std[1] == pytest.approx(0.1, rel=1e-2)
+    fit = calibrated(one, start={"omega": 2.9, "cubic": CUBIC}, prior_std={"cubic": 0.1})
+    # At the prior mean the point is matched exactly, and the posterior 1σ is that of the prior.
+    np.testing.assert_allclose(fit.values, [OMEGA, CUBIC], rtol=1e-4)
+    assert fit.std[1] == pytest.approx(0.1, rel=1e-2)
 
 
-def test_a_prior_that_is_stated_is_not_asked_for():
+def test_a_stated_prior_is_not_advised():
     velocity = np.full(9, 3.0)
     one = sj.identify.MeasuredBackbone(
         velocity, closed_form(velocity, OMEGA, CUBIC), 1e-3 * np.ones(9)
@@ -89,9 +87,9 @@ def test_a_prior_that_is_stated_is_not_asked_for():
         ({}, "state `prior_std`"),
         ({"omega": 1e3, "cubic": 1e3}, "fit fewer"),
     ):
-        found = calibrated(one, start={"omega": 2.9, "cubic": CUBIC}, prior_std=prior_std)
-        notes = [str(note) for note in found.notes if note.kind == "parameters_hardly_known"]
-        assert any(advice in note for note in notes), found.notes
+        fit = calibrated(one, start={"omega": 2.9, "cubic": CUBIC}, prior_std=prior_std)
+        notes = [str(note) for note in fit.notes if note.kind == "parameters_hardly_known"]
+        assert any(advice in note for note in notes), fit.notes
 
 
 BAD = [

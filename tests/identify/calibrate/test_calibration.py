@@ -1,4 +1,4 @@
-"""Calibration through harmonic balance: truth from virtual tests, which know nothing of the fit."""
+"""Calibration through harmonic balance: truth from virtual tests, independent of the fit."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ from snrmjax.model.parameters import (
 )
 
 HERTZ = 2 * np.pi
-ORDER = 5  # of the tests and of the fits alike: what is left out is left out of both
+ORDER = 5  # of tests and fits alike: both have the same truncation
 DRAG = "quadratic_damping.coefficient"
 
 
@@ -84,16 +84,16 @@ def test_a_linear_structure_needs_the_force_of_its_closed_form():
     omega = np.array([470.0, 500.0, 510.0])
     velocity = np.outer([0.3, 0.5j, 0.2 - 0.1j], [1.0, 1.0])
     data = sj.measure.steady_states([1] * 3, omega, [0.4] * 3, velocity, sensors=modes.sensors)
-    found = inverse_force(sj.model.structure(modes), data, harmonic_order=2)
+    fit = inverse_force(sj.model.structure(modes), data, harmonic_order=2)
     response = np.asarray(linear_response(modes, jnp.asarray(omega), jnp.ones(3)))
     # 1e-10: rounding of a system whose condition number is about 1e4.
-    np.testing.assert_allclose(found.force, velocity[:, 0] / response[:, 0], rtol=1e-10)
+    np.testing.assert_allclose(fit.force, velocity[:, 0] / response[:, 0], rtol=1e-10)
     other = response[:, 1] / response[:, 0] * velocity[:, 0]
-    np.testing.assert_allclose(found.velocity[:, 1, 1], other, rtol=1e-10)
+    np.testing.assert_allclose(fit.velocity[:, 1, 1], other, rtol=1e-10)
 
 
 @pytest.mark.long
-def test_the_measured_force_is_needed_whatever_the_instruments_write_down():
+def test_the_inverse_force_includes_the_instrument_errors():
     model = curved(
         make_effect("sensor_gain_error", {"gain": 0.05}),
         make_effect("sensor_phase_error", {"phase_deg": 3.0}),
@@ -104,12 +104,12 @@ def test_the_measured_force_is_needed_whatever_the_instruments_write_down():
         rigid_body_participation=jnp.array([30.0]),
     )
     data = curved_test(model, recording=sj.simulate.Recording(keep_harmonics=(2, 3)))
-    found = inverse_force(model, data, harmonic_order=ORDER)
-    assert bool(found.converged.all())
+    fit = inverse_force(model, data, harmonic_order=ORDER)
+    assert bool(fit.converged.all())
     # 1e-7: the tests' states are solved to 1e-10 of the displacement, of which the force at
     # resonance is a tenth or less.
-    np.testing.assert_allclose(found.force, data.force, rtol=1e-7)
-    np.testing.assert_allclose(found.velocity[:, 2:4, 0], data.harmonics[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(fit.force, data.force, rtol=1e-7)
+    np.testing.assert_allclose(fit.velocity[:, 2:4, 0], data.harmonics[:, 0], rtol=1e-6)
 
 
 @pytest.mark.long
@@ -131,12 +131,12 @@ def test_derivatives_of_the_inverse_force_are_those_of_central_differences(exact
     np.testing.assert_allclose(forward, backward, rtol=1e-9, atol=1e-9)
 
 
-def test_the_inverse_force_says_itself(exact):
-    found = inverse_force(curved(), exact, harmonic_order=ORDER)
+def test_the_inverse_force_has_a_repr_a_table_and_a_plot(exact):
+    fit = inverse_force(curved(), exact, harmonic_order=ORDER)
     n = exact.n_states
-    assert repr(found).startswith(f"InverseForce: {n} states")
-    assert found.to_xarray().force_re_n.attrs["units"] == "N"
-    assert isinstance(found.plot(), Figure)
+    assert repr(fit).startswith(f"InverseForce: {n} states")
+    assert fit.to_xarray().force_re_n.attrs["units"] == "N"
+    assert isinstance(fit.plot(), Figure)
 
 
 @pytest.mark.long
@@ -164,27 +164,27 @@ def test_exact_data_of_the_flat_beam_give_its_dominant_coefficients():
     ).steady_states  # fmt: skip
     names = ("potential.1111", "potential.1112", "mode_1.natural_frequency", "mode_1.damping_ratio")
     start, truth = scaled(beam, names, np.array([1.3, 0.7, 1.02, 0.8]))
-    found = calibrate_model(start, data, names, harmonic_order=ORDER)
-    assert found.converged
-    assert found.state_converged.all()
-    # The states are exact to 1e-10; the data tell 1112 a hundred times worse than the noise.
-    np.testing.assert_allclose(found.values, truth, rtol=1e-6)
-    assert found.noise_scale < 1e-6
-    assert found.model.potential.coefficient_std[20] == found.std[0]
-    assert repr(found).startswith("CalibratedModel: 4 parameters from 12 of 12 steady states")
-    assert "potential.1111 = " in repr(found)
-    np.testing.assert_array_equal(found.to_xarray().parameter, names)
-    assert isinstance(found.plot(), Figure)
+    fit = calibrate_model(start, data, names, harmonic_order=ORDER)
+    assert fit.converged
+    assert fit.state_converged.all()
+    # The states are exact to 1e-10; 1112 is a hundred times less certain than the noise.
+    np.testing.assert_allclose(fit.values, truth, rtol=1e-6)
+    assert fit.noise_scale < 1e-6
+    assert fit.model.potential.coefficient_std[20] == fit.std[0]
+    assert repr(fit).startswith("CalibratedModel: 4 parameters from 12 of 12 steady states")
+    assert "potential.1111 = " in repr(fit)
+    np.testing.assert_array_equal(fit.to_xarray().parameter, names)
+    assert isinstance(fit.plot(), Figure)
 
 
 @pytest.mark.long
-def test_drag_is_found_from_zero_and_beside_the_damping_of_the_mode():
+def test_drag_is_fitted_from_zero_along_with_the_damping_of_the_mode():
     model = curved(make_effect("quadratic_damping", {"coefficient": 0.8}))
     names = (DRAG, "mode_1.damping_ratio", "potential.1111")
     start, truth = scaled(model, names, np.array([0.0, 1.2, 1.1]))
-    found = calibrate_model(start, curved_test(model), names, harmonic_order=ORDER)
-    assert found.converged
-    np.testing.assert_allclose(found.values, truth, rtol=1e-6)  # of states exact to 1e-10
+    fit = calibrate_model(start, curved_test(model), names, harmonic_order=ORDER)
+    assert fit.converged
+    np.testing.assert_allclose(fit.values, truth, rtol=1e-6)  # of states exact to 1e-10
 
 
 NAMES = ("potential.1111", "mode_1.damping_ratio")
@@ -193,39 +193,39 @@ NAMES = ("potential.1111", "mode_1.damping_ratio")
 @pytest.mark.long
 def test_errors_are_as_large_as_stated(exact):
     start, truth = scaled(curved(), NAMES, np.array([1.3, 0.7]))
-    found = [
+    fits = [
         calibrate_model(start, noisy(exact, seed), NAMES, harmonic_order=ORDER)
         for seed in range(30)
     ]
     distance = sum(
-        (f.values - truth) @ np.linalg.solve(f.covariance, f.values - truth) for f in found
+        (f.values - truth) @ np.linalg.solve(f.covariance, f.values - truth) for f in fits
     )
     low, high = chi2.ppf([0.001, 0.999], 30 * len(NAMES))
     assert low < distance < high
     freedom = 2 * exact.n_states - len(NAMES)
     low, high = chi2.ppf([0.001, 0.999], 30 * freedom)
-    assert low < freedom * sum(f.reduced_chi_square for f in found) < high
+    assert low < freedom * sum(f.reduced_chi_square for f in fits) < high
 
 
 @pytest.mark.long
 def test_the_order_of_rows_does_not_matter(exact):
     start, _ = scaled(curved(), NAMES, np.array([1.1, 0.9]))
     data = noisy(exact, 3)
-    turned = np.random.default_rng(0).permutation(data.n_states)
+    permutation = np.random.default_rng(0).permutation(data.n_states)
     first = calibrate_model(start, data, NAMES, harmonic_order=ORDER)
-    second = calibrate_model(start, rows(data, turned), NAMES, harmonic_order=ORDER)
+    second = calibrate_model(start, rows(data, permutation), NAMES, harmonic_order=ORDER)
     # The solver stops within 1e-8 of 1σ, which is 1 % of the values.
     np.testing.assert_allclose(second.values, first.values, rtol=1e-8)
     np.testing.assert_allclose(second.covariance, first.covariance, rtol=1e-6)
-    np.testing.assert_allclose(second.residuals, first.residuals[turned], atol=1e-6)
+    np.testing.assert_allclose(second.residuals, first.residuals[permutation], atol=1e-6)
 
 
 @pytest.mark.long
-def test_what_a_level_shares_is_found(exact):
+def test_errors_common_to_a_level_are_fitted(exact):
     gain = np.array([0.03, -0.02, 0.01])
-    turn = np.array([-0.02, 0.01, 0.03])
+    phase = np.array([-0.02, 0.01, 0.03])
     level = np.unique(np.asarray(exact.level), return_inverse=True)[1]
-    factor = (np.exp(gain) * np.exp(1j * turn))[level, None]
+    factor = (np.exp(gain) * np.exp(1j * phase))[level, None]
     data = noisy(exact, 0, 0.0, 0.0, 0.0)
     data = dataclasses.replace(
         data,
@@ -233,34 +233,36 @@ def test_what_a_level_shares_is_found(exact):
         velocity_std=1e-4 * jnp.abs(data.velocity),
         phase_std=jnp.full(data.velocity.shape, 1e-4),
     )
-    found = calibrate_model(
+    fit = calibrate_model(
         scaled(curved(), NAMES[1:], 1.2)[0], data, NAMES[1:], harmonic_order=ORDER,
         level_gain_std=0.03, level_phase_std=0.03,
     )  # fmt: skip
-    # The prior pulls by the square of error over 1σ, 1e-5, times what damping leaves open, ten.
-    np.testing.assert_allclose(found.level_gain, gain, atol=1e-5)
-    np.testing.assert_allclose(found.level_phase, turn, atol=1e-5)
+    # Bias by the prior: (error over 1σ)², 1e-5, times ten for what damping leaves undetermined.
+    np.testing.assert_allclose(fit.level_gain, gain, atol=1e-5)
+    np.testing.assert_allclose(fit.level_phase, phase, atol=1e-5)
     without = calibrate_model(curved(), data, NAMES[1:], harmonic_order=ORDER)
     assert without.noise_scale > 10
     assert without.notes[-1].kind == "calibration_noise"
 
 
 @pytest.mark.long
-def test_a_prior_weighs_as_much_as_its_std_says(exact):
+def test_a_prior_weighs_by_its_std(exact):
     start, _ = scaled(curved(), NAMES[1:], 0.998)
     data = noisy(exact, 1)
     free = calibrate_model(start, data, NAMES[1:], harmonic_order=ORDER)
     std = jnp.asarray(free.std)
-    held = dataclasses.replace(start, modes=dataclasses.replace(start.modes, damping_ratio_std=std))
-    found = calibrate_model(held, data, NAMES[1:], harmonic_order=ORDER, priors=True)
+    with_prior = dataclasses.replace(
+        start, modes=dataclasses.replace(start.modes, damping_ratio_std=std)
+    )
+    fit = calibrate_model(with_prior, data, NAMES[1:], harmonic_order=ORDER, priors=True)
     middle = 0.5 * (free.values[0] + 0.998 * 0.05)
-    # The force is nearly linear in damping: what is left is the whitening of another place.
-    np.testing.assert_allclose(found.values[0], middle, atol=0.02 * free.std[0])
-    np.testing.assert_allclose(found.std[0], free.std[0] / np.sqrt(2), rtol=0.01)
+    # The force is nearly linear in damping: the rest is whitening at other parameters.
+    np.testing.assert_allclose(fit.values[0], middle, atol=0.02 * free.std[0])
+    np.testing.assert_allclose(fit.std[0], free.std[0] / np.sqrt(2), rtol=0.01)
 
 
 @pytest.mark.long
-def test_other_sensors_and_harmonics_are_weighed_by_their_errors():
+def test_other_sensors_and_harmonics_are_weighted_by_their_errors():
     modes = sj.model.linear_modes(
         [400.0, 2500.0], [0.03, 0.01], [[2.0, 1.0], [5.0, -3.0]], [100.0, 20.0]
     )
@@ -275,13 +277,13 @@ def test_other_sensors_and_harmonics_are_weighed_by_their_errors():
             appropriation=(0.5, 1.0), recording=sj.simulate.Recording(errors, seed, (2, 3)),
         ).steady_states  # fmt: skip
         start, truth = scaled(model, names, np.array([1.2, 0.8]))
-        found = calibrate_model(start, data, names, harmonic_order=ORDER)
-        columns = int(np.isfinite(found.residuals).sum())
+        fit = calibrate_model(start, data, names, harmonic_order=ORDER)
+        columns = int(np.isfinite(fit.residuals).sum())
         assert columns == data.n_states * 2 * (1 + 1 + 4)
-        chi += found.reduced_chi_square * (columns - 2)
+        chi += fit.reduced_chi_square * (columns - 2)
         freedom += columns - 2
-        miss = found.values - truth
-        distance += miss @ np.linalg.solve(found.covariance, miss)
+        error = fit.values - truth
+        distance += error @ np.linalg.solve(fit.covariance, error)
     low, high = chi2.ppf([0.001, 0.999], freedom)
     assert low < chi < high
     assert distance < chi2.ppf(0.999, 8)
@@ -293,14 +295,14 @@ def test_a_state_without_a_balanced_motion_has_no_weight(exact):
     velocity = exact.velocity.at[4].set(1e150)
     data = dataclasses.replace(exact, velocity=velocity)
     start, truth = scaled(curved(), NAMES, 1.1)
-    found = calibrate_model(start, data, NAMES, harmonic_order=ORDER)
-    assert np.flatnonzero(~found.state_converged).tolist() == [4]
-    assert any(note.get("states") == (4,) for note in found.notes)
-    assert np.isnan(found.residuals[4]).all()
-    np.testing.assert_allclose(found.values, truth, rtol=1e-6)  # as above
+    fit = calibrate_model(start, data, NAMES, harmonic_order=ORDER)
+    assert np.flatnonzero(~fit.state_converged).tolist() == [4]
+    assert any(note.get("states") == (4,) for note in fit.notes)
+    assert np.isnan(fit.residuals[4]).all()
+    np.testing.assert_allclose(fit.values, truth, rtol=1e-6)  # as above
 
 
-def test_names_of_all_numbers_of_a_model():
+def test_names_of_all_parameters_of_a_model():
     twice = make_effect("quadratic_damping", {"coefficient": 0.8})
     names = parameter_names(curved(twice, twice))
     assert names == (
@@ -323,12 +325,12 @@ def test_names_of_all_numbers_of_a_model():
         ("potential.111", "sequence of names"),
     ],
 )
-def test_wrong_names_are_told(exact, names, message):
+def test_wrong_names_are_refused(exact, names, message):
     with pytest.raises(ValueError, match=message):
         calibrate_model(curved(), exact, names)
 
 
-def test_data_that_do_not_do_are_told(exact):
+def test_insufficient_data_are_refused(exact):
     with pytest.raises(ValueError, match="2 parameters need more than 2 data"):
         calibrate_model(curved(), rows(exact, [0]), NAMES)
     with pytest.raises(ValueError, match="sensors"):

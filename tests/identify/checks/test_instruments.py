@@ -1,4 +1,4 @@
-"""Whether a joint fit says which errors of the instruments its data do not determine."""
+"""Notes and refusals of a joint fit whose data do not determine the instrument errors."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def on_the_gain(fit):
 
 
 @pytest.mark.long
-def test_a_gain_that_the_inertia_determines_is_taken_without_a_word():
+def test_a_gain_determined_by_inertia_is_accepted_without_a_note():
     fit = sj.fit_jointly(driven(60), modes(), backbone="polynomial:1", damping="polynomial:1")
     assert float(np.exp(fit.unknowns.log_force_gain)) == pytest.approx(GAIN, rel=0.01)
     assert on_the_gain(fit) == []
@@ -29,7 +29,7 @@ def test_a_gain_that_the_inertia_determines_is_taken_without_a_word():
     ],
 )
 def test_states_near_resonance_hardly_determine_the_gain(widest, kind):
-    """At resonance the force is the damping's, and half of both does the same."""
+    """At resonance the force balances the damping: half of both fits equally well."""
     data = driven(widest, 2, noise=0.01) if widest < 1 else driven(widest)
     curves = {"backbone": "polynomial:1", "damping": "polynomial:1"}
     if kind is None:
@@ -42,16 +42,16 @@ def test_states_near_resonance_hardly_determine_the_gain(widest, kind):
     assert note.kind == kind
 
 
-def test_few_states_of_one_level_are_fitted_too():
-    """Smoothing splines through two knots have no bends whose size could be found."""
+def test_few_states_of_one_level_are_fitted():
+    """Smoothing splines through two knots have no roughness to estimate."""
     data = driven(8)
     data = data.select(np.asarray(data.level) == 4)
     fit = sj.fit_jointly(data, modes())
     assert len(on_the_gain(fit)) == 1
 
 
-def test_the_velocity_axis_ends_where_it_was_measured():
-    """Levels whose gains drift are brought onto one curve, but the axis is that of the record."""
+def test_the_velocity_axis_ends_at_the_measured_velocity():
+    """Levels with drifting gains are brought onto one curve, but the axis is that of the record."""
     data = driven(60, drift=0.1)
     fit = sj.fit_jointly(data, modes(), backbone="polynomial:1", damping="polynomial:1")
     assert fit.noise.level_std[0] > 0.02
@@ -61,7 +61,7 @@ def test_the_velocity_axis_ends_where_it_was_measured():
     assert float(as_backbone(fit).largest) == pytest.approx(fit.largest[0], rel=1e-12)
 
 
-def upper_branch(turned=1.0):
+def upper_branch(sign=1.0):
     """Exact states of a hardening mode with 0.1 % of damping, on one side of resonance only.
 
     By (ω̃² − Ω² + iΩδ) X = A F, solved for Ω at a given |X|.
@@ -77,34 +77,34 @@ def upper_branch(turned=1.0):
             level.append(number)
             omega.append(np.sqrt(squared))
             force.append(load)
-            velocity.append(turned * 1j * np.sqrt(squared) * x)
+            velocity.append(sign * 1j * np.sqrt(squared) * x)
     return sj.measure.steady_states(level, omega, force, velocity)
 
 
 @pytest.mark.parametrize(
-    ("free", "turned"),
+    ("free", "sign"),
     [(("instrument_phase",), 1.0), (("instrument_phase",), -1.0), (("force_gain",), 1.0)],
 )
-def test_no_fit_that_frees_an_instrument_ends_with_damping_below_zero(free, turned):
-    """Of one side of resonance force and damping turned by 180° fit as well: the truth is 0.1 %."""
+def test_a_free_instrument_error_never_gives_negative_damping(free, sign):
+    """On one side of resonance a reversed force with negative damping fits too: truth is 0.1 %."""
     one = sj.model.linear_modes([900.0], [0.001], [[1.0]], [1.0])
-    fit = sj.fit_jointly(upper_branch(turned), one, free=free)
+    fit = sj.fit_jointly(upper_branch(sign), one, free=free)
     curve = fit.unknowns.modal_damping
     found = np.asarray(curve(fit.motion().amplitude(curve)))
-    np.testing.assert_allclose(found, 1.8, rtol=0.05)  # 2ζω of the states, to what no noise leaves
-    expected = 0.0 if turned > 0 else np.pi
+    np.testing.assert_allclose(found, 1.8, rtol=0.05)  # 2ζω of the states, without noise
+    expected = 0.0 if sign > 0 else np.pi
     error = float(fit.unknowns.instrument_phase) - expected if "force_gain" not in free else 0.0
     assert abs(np.angle(np.exp(1j * error))) < 0.005
 
 
-def test_a_known_force_against_the_motion_is_refused():
+def test_a_known_force_opposing_the_motion_is_refused():
     one = sj.model.linear_modes([900.0], [0.001], [[1.0]], [1.0])
     with pytest.raises(ValueError, match=r"against the force|negative at every state"):
         sj.fit_jointly(upper_branch(-1.0), one)
 
 
 class _Fit:
-    """What a fit says of its instruments."""
+    """Stand-in for a fit's instrument errors."""
 
     free = ("instrument_phase", "force_offset")
     notes = ()
@@ -116,22 +116,22 @@ class _Fit:
         return self.free
 
     def motion(self):
-        raise AssertionError  # only a gain asks for phases
+        raise AssertionError  # only a gain needs phases
 
 
 @pytest.mark.parametrize(
-    ("std", "doubted"),
+    ("std", "noted"),
     [
         ((0.01, 0.05), []),
         ((np.radians(8), 0.05), ["instrument_phase"]),
         ((0.01, 0.3), ["force_offset"]),
     ],
 )
-def test_offset_and_phase_have_bounds_too(std, doubted):
+def test_offset_and_phase_have_bounds_too(std, noted):
     notes = notes_on_instruments(_Fit(*std))
-    assert [note["name"] for note in notes] == doubted
+    assert [note["name"] for note in notes] == noted
 
 
-def test_an_offset_of_any_size_is_refused():
+def test_an_undetermined_offset_is_refused():
     with pytest.raises(ValueError, match="cannot determine `force_offset`"):
         notes_on_instruments(_Fit(0.01, 1.5))

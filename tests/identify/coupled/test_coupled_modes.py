@@ -1,4 +1,4 @@
-"""Coupled modes recognised and fitted; truth from a harmonic balance of its own."""
+"""Coupled modes identified and fitted; truth from an independent harmonic balance."""
 
 import dataclasses
 
@@ -28,19 +28,19 @@ ONE = {(4, 0): 2e4, (3, 1): 1e4, (2, 2): 5e4, (0, 4): 1e4}
 def test_the_interaction_is_recognised(terms, modes, ratio):
     data = steady_states(terms, noise=3e-3, seed=1, modes=modes)
     model = structure(modes=modes)
-    found = sj.identify.coupled_modes(data, model, harmonic_order=5)
-    assert found.coupled == (ratio is not None)
+    result = sj.identify.coupled_modes(data, model, harmonic_order=5)
+    assert result.coupled == (ratio is not None)
     assert other_mode_moves(data, model) == (ratio is not None)
-    names = dict(zip(found.calibration.names, range(20), strict=False))
+    names = dict(zip(result.calibration.names, range(20), strict=False))
     for (a, b), value in terms.items():
         k = names.get(f"potential.{'1' * a}{'2' * b}")
         if k is not None:
-            assert abs(found.calibration.values[k] - value) < 3.3 * found.calibration.std[k]
+            assert abs(result.calibration.values[k] - value) < 3.3 * result.calibration.std[k]
     if ratio is not None:
-        assert (found.interaction.other, found.interaction.ratio) == (1, ratio)
+        assert (result.interaction.other, result.interaction.ratio) == (1, ratio)
 
 
-def test_fundamentals_of_two_sensors_do():
+def test_fundamentals_of_two_sensors_suffice():
     data = steady_states(ONE, noise=3e-3, seed=1, modes=CLOSE)
     alone = sj.measure.steady_states(
         *(data.level, data.frequency, data.force, data.velocity),
@@ -48,15 +48,15 @@ def test_fundamentals_of_two_sensors_do():
         phase_std=data.phase_std,
         sensors=data.sensors,
     )
-    found = sj.identify.coupled_modes(alone, structure(modes=CLOSE), harmonic_order=5)
-    assert found.coupled
-    assert found.calibration.state_converged.all()
-    k = found.calibration.names.index("potential.1122")
-    assert abs(found.calibration.values[k] - ONE[2, 2]) < 3.3 * found.calibration.std[k]
+    result = sj.identify.coupled_modes(alone, structure(modes=CLOSE), harmonic_order=5)
+    assert result.coupled
+    assert result.calibration.state_converged.all()
+    k = result.calibration.names.index("potential.1122")
+    assert abs(result.calibration.values[k] - ONE[2, 2]) < 3.3 * result.calibration.std[k]
 
 
 def test_evidence_of_terms_is_that_of_integrals():
-    # Two terms, one measured to be 3 ± 1, the other unseen: by quadrature over both coefficients.
+    # Two terms, one measured as 3 ± 1, the other unknown: by quadrature over both coefficients.
     terms = coupling_terms(0, 1, 3)[:2]
     information, values = np.diag([1.0, 1e-12]), np.array([3.0, 0.0])
     chosen = chosen_terms(terms, values, information, np.array([10.0, 10.0]))
@@ -71,44 +71,46 @@ def test_evidence_of_terms_is_that_of_integrals():
 def test_the_bias_of_one_mode_is_that_of_a_backbone_of_two():
     data, model = steady_states(ONE, modes=CLOSE), structure(modes=CLOSE)
     coupled = sj.identify.coupled_modes(data, model, harmonic_order=5)
-    found = sj.identify_backbone(data, model)
-    bias = single_mode_bias(found, coupled)
+    identification = sj.identify_backbone(data, model)
+    bias = single_mode_bias(identification, coupled)
     velocity, frequency, _, _ = bias.at_largest
-    # The conservative mode of the true potential, by rule-of-thumb balance of one harmonic: q cos.
+    # The conservative mode of the true potential, by one-harmonic balance: q cos.
     q = np.array([velocity / 100, 0.0])
     omega = 100.0
     for _ in range(200):
         a, b = q
-        pull = 0.75 * np.array(
+        force = 0.75 * np.array(
             [
                 4 * 2e4 * a**3 + 3 * 1e4 * a**2 * b + 2 * 5e4 * a * b**2,
                 1e4 * a**3 + 2 * 5e4 * a**2 * b + 4 * 1e4 * b**3,
             ]
         )
-        omega = np.sqrt(CLOSE[0] ** 2 + pull[0] / a)
-        b = -(pull[1] - 0.75 * 2 * 5e4 * a**2 * b) / (
+        omega = np.sqrt(CLOSE[0] ** 2 + force[0] / a)
+        b = -(force[1] - 0.75 * 2 * 5e4 * a**2 * b) / (
             CLOSE[1] ** 2 - omega**2 + 0.75 * 2 * 5e4 * a**2
         )
-        seen = np.array([[1.0, 0.8], [0.7, -1.1]])[model.modes.sensors.index(found.backbone.sensor)]
+        seen = np.array([[1.0, 0.8], [0.7, -1.1]])[
+            model.modes.sensors.index(identification.backbone.sensor)
+        ]
         a = (velocity / omega - seen[1] * b) / seen[0]
         q = np.array([a, b])
-    identified = float(found.backbone.sampled(50).natural_frequency[-1])
+    identified = float(identification.backbone.sampled(50).natural_frequency[-1])
     # Harmonics move the frequency by some 1e-6.
     assert frequency == pytest.approx(identified / omega - 1, abs=5e-6)
     assert abs(frequency) > 1e-4
 
 
-def test_identify_says_it_and_does_better(tmp_path):
+def test_identify_reports_and_models_the_coupling(tmp_path):
     data, model = steady_states(ONE, noise=2e-3, seed=3, modes=CLOSE), structure(modes=CLOSE)
-    found = identify_test(data, model, modes=2, predict_force=(0.8,))
-    kinds = {note.kind for note in found.notes if not isinstance(note, str)}
+    result = identify_test(data, model, modes=2, predict_force=(0.8,))
+    kinds = {note.kind for note in result.notes if not isinstance(note, str)}
     assert {"modes_coupled", "single_mode_biased"} <= kinds
-    sj.write_results(found, tmp_path)
+    sj.write_results(result, tmp_path)
     written = {path.name for path in tmp_path.iterdir()}
     assert {"model.toml", "prediction.csv", "coupled_backbone.png", "report.html"} <= written
     completed = sj.read_model(tmp_path / "model.toml")
     assert "1112" in {"".join(str(m + 1) for m in k) for k in completed.potential.monomials}
-    # Not asked for, it is looked at: the sensors show the second mode.
+    # Assessed by default: the sensors show the second mode.
     assert identify_test(data, model).coupled is not None
     assert identify_test(data, model, modes=1).coupled is None
     with pytest.raises(ValueError, match="`--modes` must be 1 or 2"):
@@ -116,10 +118,10 @@ def test_identify_says_it_and_does_better(tmp_path):
 
 
 def test_a_drive_voltage_has_the_gain_of_the_joint_fit():
-    """Not asked for the gain once more: coupled modes are of the force that the fit found."""
+    """Coupled modes use the force gain of the joint fit without a further option."""
     data, model = steady_states(ONE, noise=2e-3, seed=3, modes=CLOSE), structure(modes=CLOSE)
     of_volts = dataclasses.replace(data, force=data.force * np.nan, drive=data.force / 0.4)
-    found = identify_test(of_volts, model, modes=2, fit="auto", free=("force_gain",))
-    (gain,) = [note for note in found.notes if getattr(note, "kind", "") == "force_from_drive"]
+    result = identify_test(of_volts, model, modes=2, fit="auto", free=("force_gain",))
+    (gain,) = [note for note in result.notes if getattr(note, "kind", "") == "force_from_drive"]
     assert gain["newtons_per_volt"] == pytest.approx(0.4, rel=0.1)
-    assert found.coupled.modes.coupled
+    assert result.coupled.modes.coupled

@@ -48,7 +48,7 @@ def test_programs_have_the_values_and_derivatives_of_the_host(kind, argument):
         return of(parameters, at), *along, back
 
     value, slopes, mixed, back = map(np.asarray, all_of(general.parameters, jnp.asarray(at)))
-    assert np.all(slopes[:, n:] == 0)  # what the family does not have moves nothing
+    assert np.all(slopes[:, n:] == 0)  # padding parameters have no effect
     host = curve.linearised(at)
     unit = 1e-9 * np.abs(host.by_parameters).max()
     np.testing.assert_allclose(value, host.value, rtol=1e-12)
@@ -72,7 +72,7 @@ def test_every_parameter_has_a_name_and_the_limit_at_zero_is_exact(kind):
     at_zero = float(curve(jnp.zeros(())))
     slope = jax.grad(lambda a: curve(a))(1e-9)
     if kind == "viscous_coulomb":
-        assert abs(at_zero) == np.inf  # dry friction outgrows any velocity
+        assert abs(at_zero) == np.inf  # equivalent damping of dry friction is infinite
     else:
         assert at_zero == pytest.approx(float(curve.parameters[0]), rel=1e-12)
         assert np.isfinite(float(slope))
@@ -89,7 +89,7 @@ def test_the_spline_is_the_natural_cubic_spline_of_the_square():
     truth = CubicSpline(knots, values, bc_type="natural")
     inside = np.linspace(0, 1, 57)
     np.testing.assert_allclose(curve(1.3 * np.sqrt(inside)), truth(inside), rtol=1e-11)
-    # Beyond the last knot it goes on straight in the squared amplitude.
+    # Beyond the last knot it is linear in the squared amplitude.
     beyond = float(curve(jnp.asarray(1.3 * np.sqrt(1.4))))
     assert beyond == pytest.approx(values[-1] + 0.4 * float(truth(1.0, 1)), rel=1e-11)
 
@@ -110,7 +110,7 @@ def test_a_start_reproduces_its_own_family(kind, size, truth):
     np.testing.assert_allclose(curve(AMPLITUDE), truth(AMPLITUDE), rtol=1e-11)
 
 
-def test_one_of_the_power_laws_starts_at_each_exponent_tried():
+def test_a_power_law_starts_at_each_exponent_tried():
     starts = PowerLaw.starts(1, Scattered("velocity", AMPLITUDE, 1 + AMPLITUDE**2, np.ones(40)))
     np.testing.assert_allclose([float(s.exponent) for s in starts], PowerLaw.tried, rtol=1e-12)
     best = starts[PowerLaw.tried.index(2.0)]

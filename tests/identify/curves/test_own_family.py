@@ -1,4 +1,4 @@
-"""A user's own family: its curve, its numbers found by a fit, and what predicts responses."""
+"""A user's own family: its curve, its fitted numbers, and response prediction."""
 
 from typing import ClassVar
 
@@ -34,7 +34,7 @@ def damping(v):
 
 
 def slipping(noise):
-    """States of nine levels with the exact damping, and so much of the usual noise."""
+    """States of nine levels with the exact damping, and a multiple of the usual noise."""
     rows = []
     for level, tip in enumerate(np.geomspace(5e-5, 2e-3, 9)):
         for phase in np.radians(np.linspace(-60, 60, 9)):
@@ -66,9 +66,9 @@ def fit():
 
 def test_a_fit_finds_the_numbers_of_an_own_family(fit):
     assert [note.kind for note in fit.notes if note.kind == "family_leaves"] == []
-    place = fit.names().index("damping.log_speed")
+    index = fit.names().index("damping.log_speed")
     value, std = (
-        np.asarray(one)[place] for one in (fit.vector()[0], np.sqrt(np.diag(fit.covariance)))
+        np.asarray(one)[index] for one in (fit.vector()[0], np.sqrt(np.diag(fit.covariance)))
     )
     curve = fit.unknowns.modal_damping
     assert curve.label == "viscous_sliding@velocity"
@@ -78,10 +78,10 @@ def test_a_fit_finds_the_numbers_of_an_own_family(fit):
     assert np.all(np.abs(values.modal_damping - damping(AT)) < 3 * values.modal_damping_std)
 
 
-def test_programs_draw_the_curve_and_its_slopes(fit):
+def test_programs_have_the_curve_and_its_slopes(fit):
     curve = fit.unknowns.modal_damping
     general, host = packed(curve), curve.linearised(AT)
-    # A spline through 64 values, of which one lies in each 2 % of the largest amplitude.
+    # A spline through 64 values, about one per 2 % of the largest amplitude.
     np.testing.assert_allclose(general(AT), host.value, rtol=1e-3)
     slopes = jax.jacfwd(lambda p: general.__class__(**{**vars(general), "parameters": p})(AT))(
         general.parameters
@@ -98,7 +98,7 @@ def test_responses_follow_from_an_own_family(fit):
     assert damping(found.velocity) * found.velocity == pytest.approx(CONSTANT, rel=2e-2)
 
 
-def test_what_an_own_family_leaves_is_drawn():
+def test_the_remainder_of_an_own_family_is_fitted():
     class Viscous(sj.identify.OwnFamily):
         kind = "own_viscous"
         names = ("viscous",)

@@ -1,4 +1,4 @@
-"""Responses of a joint fit against its curves' closed form, bands against differences."""
+"""Responses of a joint fit against closed forms, bands against finite differences."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
-from snrmjax.identify.inference.forced_motion import Place, solved_point
+from snrmjax.identify.inference.forced_motion import InitialPoint, solved_point
 from snrmjax.identify.inference.optimal_design import AdviceStatus
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES
 from snrmjax.io.joint_results import write_next
@@ -28,7 +28,7 @@ def fit():
 
 @pytest.fixture(scope="module")
 def exact_fit():
-    """The same of exact states: its curves are the known ones."""
+    """A fit of exact states: its curves are the known ones."""
     return joint_fits.exact_fit()
 
 
@@ -50,7 +50,7 @@ def test_resonance_of_known_curves(exact_fit):
 
 
 @pytest.mark.long
-def test_a_larger_ratio_looks_further(exact_fit):
+def test_a_larger_ratio_extends_the_range(exact_fit):
     largest = exact_fit.largest[0]
     x = 2.5 * largest
     speed = x * np.sqrt(squared(x))
@@ -60,12 +60,12 @@ def test_a_larger_ratio_looks_further(exact_fit):
     assert near.resonances == ()
     assert far.resonances[0].frequency == pytest.approx(speed / x, rel=1e-6)
     assert far.resonances[0].continued
-    # The largest amplitude lies a little beyond phase resonance.
+    # The largest amplitude lies slightly beyond phase resonance.
     assert far.notes[0]["ratio"] == pytest.approx(2.5, rel=1e-3)
 
 
 @pytest.mark.long
-def test_a_curve_that_falls_beyond_the_data_leaves_what_is_inside(exact_fit):
+def test_a_curve_that_falls_beyond_the_data_keeps_the_inner_resonance(exact_fit):
     # ω̃² = a(1 − 0.4 u): X ω̃ has its largest value at u = 1.25, short of 1.5² times the data.
     vector = np.array(exact_fit.vector()[0])
     vector[1] = -0.4 * vector[0]
@@ -73,24 +73,24 @@ def test_a_curve_that_falls_beyond_the_data_leaves_what_is_inside(exact_fit):
     x = 0.5 * float(falling.unknowns.squared_frequency.scale)
     speed = x * np.sqrt(vector[0] * (1 - 0.4 * 0.25))
     force = speed * float(falling.unknowns.modal_damping(speed)) / CONSTANT
-    # Beyond that turn the velocity falls, and the force has a second resonance there.
-    tips = sj.identify.fitted_response(falling, force)[0].resonances
-    (found,) = (point for point in tips if not point.continued)
+    # Beyond that maximum the velocity falls, and there is a second resonance.
+    resonances = sj.identify.fitted_response(falling, force)[0].resonances
+    (found,) = (point for point in resonances if not point.continued)
     assert found.frequency == pytest.approx(speed / x, rel=1e-9)
     assert found.velocity == pytest.approx(speed, rel=1e-9)
 
 
-def test_every_point_obeys_the_known_curves(exact_fit):
+def test_every_point_satisfies_the_known_curves(exact_fit):
     curve = sj.identify.fitted_response(exact_fit, FORCE)[0]
     speed = np.abs(curve.velocity)
     x = speed / curve.frequency
     needed = squared(x) - curve.frequency**2 + 1j * curve.frequency * damping(speed)
-    # Newton steps end at rounding, which a steep flank of the curve enlarges.
+    # Newton converges to rounding, which a steep flank of the curve amplifies.
     np.testing.assert_allclose(np.abs(needed) * x / CONSTANT, FORCE, rtol=1e-8)
     np.testing.assert_allclose(np.angle(needed) + np.angle(curve.velocity), np.pi / 2, atol=1e-8)
 
 
-def test_folds_are_where_the_frequency_turns(exact_fit):
+def test_folds_are_where_the_frequency_reverses(exact_fit):
     found = sj.identify.fitted_response(exact_fit, FORCE)[0].folds
     assert len(found) == 2
     # Ω against X at fixed force, scanned: |(ω̃² − Ω²) + iΩδ| X = A F by bisection above ω̃.
@@ -107,8 +107,10 @@ def test_folds_are_where_the_frequency_turns(exact_fit):
         below = needed(middle) < CONSTANT * FORCE
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     omega = np.where(there, low, np.nan)
-    turns = [np.nanmin(omega[: int(np.nanargmax(omega))]), np.nanmax(omega)]
-    np.testing.assert_allclose(sorted(p.frequency for p in found), sorted(turns), rtol=1e-6)
+    fold_frequencies = [np.nanmin(omega[: int(np.nanargmax(omega))]), np.nanmax(omega)]
+    np.testing.assert_allclose(
+        sorted(p.frequency for p in found), sorted(fold_frequencies), rtol=1e-6
+    )
 
 
 @pytest.mark.long
@@ -116,8 +118,8 @@ def test_folds_are_where_the_frequency_turns(exact_fit):
 def test_slopes_of_points_are_central_differences(fit, kind):
     curve = sj.identify.fitted_response(fit, FORCE, of=ON_THE_CURVES)[0]
     best = max(curve.resonances if kind == "resonance" else curve.folds, key=lambda p: p.velocity)
-    place = Place(kind, best.velocity / best.frequency, best.frequency)
-    slopes = solved_point(fit, FORCE, place).slopes[:2]
+    start = InitialPoint(kind, best.velocity / best.frequency, best.frequency)
+    slopes = solved_point(fit, FORCE, start).slopes[:2]
     vector = np.asarray(fit.vector()[0])
     for k in range(4):  # the curves' own parameters
         step = 1e-5 * max(abs(vector[k]), 1.0)
@@ -129,19 +131,19 @@ def test_slopes_of_points_are_central_differences(fit, kind):
             near = max(points, key=lambda p: p.velocity)
             values.append([near.frequency, near.velocity])
         difference = (np.array(values[0]) - np.array(values[1])) / (2 * step)
-        # Differences are good to step² and to the points' 1e-9 over the step.
+        # Errors of the differences: step², and the points' 1e-9 over the step.
         np.testing.assert_allclose(slopes[:, k], difference, rtol=1e-4, atol=1e-7)
     std = np.sqrt(np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes))
     np.testing.assert_allclose([best.frequency_std, best.velocity_std], std, rtol=1e-9)
 
 
 @pytest.mark.long
-def test_band_of_a_curve_is_the_spread_of_drawn_curves(fit):
+def test_band_of_a_curve_is_the_spread_of_sampled_curves(fit):
     rng = np.random.default_rng(0)
     vector = np.asarray(fit.vector()[0])
     root = np.linalg.cholesky(fit.covariance + 1e-14 * np.eye(len(vector)))
     speeds = np.array([0.3, 0.6, 0.85])
-    drawn = [
+    samples = [
         np.asarray(
             sj.identify.fitted_values(
                 moved(fit, vector + root @ rng.normal(size=len(vector))), speeds
@@ -150,8 +152,8 @@ def test_band_of_a_curve_is_the_spread_of_drawn_curves(fit):
         for _ in range(150)
     ]
     values = sj.identify.fitted_values(fit, speeds)
-    # 150 draws know a spread to 1/sqrt(300).
-    np.testing.assert_allclose(np.std(drawn, axis=0), values.modal_damping_std, rtol=3 * 0.058)
+    # 150 draws determine a standard deviation to 1/sqrt(300).
+    np.testing.assert_allclose(np.std(samples, axis=0), values.modal_damping_std, rtol=3 * 0.058)
 
 
 def test_a_new_level_has_a_wider_band(fit):
@@ -192,10 +194,10 @@ def test_advice_narrows_the_band_and_avoids_what_cannot_be_measured(fit):
 
 
 @pytest.mark.long
-def test_advice_holds_what_it_promises():
+def test_advice_achieves_the_expected_band_ratio():
     """The measured ratio of bands after adding the advised state is the expected one.
 
-    What levels differ by is stated: by one level more it would be better known, and the band
+    Level errors are stated: estimated ones would be better known with one more level, and the band
     narrower still.
     """
     known = {"level_gain_std": 0.01, "level_phase_std": 0.003, "level_damping_std": 6e-5}
@@ -221,11 +223,11 @@ def test_advice_holds_what_it_promises():
         np.mean(np.asarray(v.modal_damping_std / v.modal_damping))
         for v in (sj.identify.fitted_values(f, at) for f in (again, fit))
     ]
-    # The state said nothing new (it lies on the fit's curve): only the bands move.
+    # The new state lies on the fit's curve: only the bands change.
     assert bands[0] / bands[1] == pytest.approx(one.expected_band_ratio, abs=0.005)
 
 
-def test_no_state_that_a_test_can_reach_is_an_answer(fit):
+def test_no_measurable_state_is_reported(fit):
     none = sj.next_measurements(fit, 2, from_frequency=5000.0)
     assert len(none) == 0
     assert none.status == AdviceStatus.NO_STATE

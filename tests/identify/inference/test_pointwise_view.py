@@ -1,4 +1,4 @@
-"""Points beside a joint fit: errors that the states of a level share move them as far as said."""
+"""Points of a joint fit: their 1σ includes the errors that the states of a level share."""
 
 import dataclasses
 
@@ -20,8 +20,8 @@ def test_points_have_the_errors_that_their_level_shares(shared, factor):
     points = sj.identify.identify_points(data, modes())
     wrong = dataclasses.replace(data, velocity=data.velocity * factor)
     moved = sj.identify.identify_points(wrong, modes())
-    said = errors_from_scatter(points, 0.0, **shared)
+    widened = errors_from_scatter(points, 0.0, **shared)
     change = np.abs(np.asarray(moved.natural_frequency - points.natural_frequency))
-    std = np.asarray(said.natural_frequency_std)
+    std = np.asarray(widened.natural_frequency_std)
     # First order in a thousandth.
     np.testing.assert_allclose(std, change, rtol=0.01, atol=2e-3 * change.max())

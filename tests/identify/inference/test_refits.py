@@ -1,4 +1,4 @@
-"""Derivatives of a joint fit by all that it was given: against refits, inside jit and vmap."""
+"""Derivatives of a joint fit by its inputs: against refits, inside jit and vmap."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ STATED = {"level_phase_std": 0.005, "level_frequency_std": 0.5, "level_damping_s
 
 @pytest.fixture(scope="module")
 def fit():
-    """A fit whose levels' errors are stated: the noise is all that it finds of magnitudes."""
+    """A fit with stated level errors: the noise is the only estimated 1σ."""
     return fitted(noisy(1, gain=0.01))
 
 
@@ -37,38 +37,38 @@ def vector(fit):
 
 @pytest.fixture(scope="module")
 def found(fit):
-    """Influences on the unknowns."""
+    """Sensitivities of the unknowns."""
     return sj.identify.influence(fit)
 
 
-def changed(fit, name, place, size):
+def changed(fit, name, index, change):
     """Inputs with one number changed."""
     none = sj.identify.FitInputs.none(fit)
-    return dataclasses.replace(none, **{name: getattr(none, name).at[place].add(size)})
+    return dataclasses.replace(none, **{name: getattr(none, name).at[index].add(change)})
 
 
 def test_influences_are_differences_of_refits(fit, vector, found):
     std = np.sqrt(np.diag(fit.covariance))
     unmoved = (np.asarray(vector(sj.identify.FitInputs.none(fit))) - fit.vector()[0]) / std
-    assert np.max(np.abs(unmoved)) < 1e-3  # rounds of the fit end within 0.05
+    assert np.max(np.abs(unmoved)) < 1e-3  # iterations of the fit end within 0.05
     inputs = (("amplitude", 7), ("phase", 20), ("force", 3), ("participation", 0))
-    for name, place in (*inputs, ("noise", 1), ("level", 0), ("level", 3), ("linear", 1)):
-        ends = (np.asarray(vector(changed(fit, name, place, sign * 1e-4))) for sign in (1, -1))
+    for name, index in (*inputs, ("noise", 1), ("level", 0), ("level", 3), ("linear", 1)):
+        ends = (np.asarray(vector(changed(fit, name, index, sign * 1e-4))) for sign in (1, -1))
         difference = np.subtract(*ends) / 2e-4 / std
-        exact = getattr(found.by, name)[:, place] / std
-        # Central differences of 1e-4: to 1e-8 of the curvature.
+        exact = getattr(found.by, name)[:, index] / std
+        # Central differences of 1e-4: errors of 1e-8 times the curvature.
         np.testing.assert_allclose(exact, difference, atol=1e-5 * np.abs(difference).max())
     assert found.names == fit.names()
 
 
-def test_influences_are_those_of_fits_made_anew(fit, found):
-    """Of the whole fit, which finds the magnitude of the noise again: it hardly matters."""
+def test_influences_are_those_of_complete_fits(fit, found):
+    """Complete fits estimate the noise again, which hardly matters."""
     slopes = values_at_displacement(fit, AT).slopes
     values = values_at_displacement(fit, AT).values
     data = noisy(1, gain=0.01)
-    size = 0.01
+    change = 0.01
     scale = np.ones(len(data.level))
-    scale[7] += size
+    scale[7] += change
     cases = {
         ("amplitude", 7): fitted(
             dataclasses.replace(data, velocity=data.velocity * scale[:, None])
@@ -76,17 +76,17 @@ def test_influences_are_those_of_fits_made_anew(fit, found):
         ("force", 7): fitted(dataclasses.replace(data, force=data.force * scale)),
         ("participation", 0): fitted(
             data,
-            sj.model.linear_modes([OMEGA], [0.012], [[SHAPE]], [PARTICIPATION * (1 + size)]),
+            sj.model.linear_modes([OMEGA], [0.012], [[SHAPE]], [PARTICIPATION * (1 + change)]),
         ),
     }
     assert CONSTANT == SHAPE * PARTICIPATION
-    for (name, place), again in cases.items():
+    for (name, index), again in cases.items():
         moved = values_at_displacement(again, AT).values - values
-        expected = slopes @ getattr(found.by, name)[:, place] * np.log1p(size)
+        expected = slopes @ getattr(found.by, name)[:, index] * np.log1p(change)
         np.testing.assert_allclose(moved, expected, atol=0.05 * np.abs(expected).max(axis=0).max())
 
 
-def test_refits_work_inside_jit_and_vmap_and_go_backwards(fit, vector):
+def test_refits_work_inside_jit_and_vmap_and_in_reverse_mode(fit, vector):
     changes = [changed(fit, "amplitude", k, 0.01) for k in (3, 30)]
     both = jax.tree.map(lambda *rows: jnp.stack(rows), *changes)
     curve = eqx.filter_jit(lambda one: sj.identify.refit(fit, one).modal_damping(1e-3))
@@ -100,12 +100,12 @@ def test_refits_work_inside_jit_and_vmap_and_go_backwards(fit, vector):
     assert jnp.vdot(back.amplitude, changes[1].amplitude) == pytest.approx(float(along), rel=1e-8)
 
 
-def test_a_refit_that_does_not_arrive_is_not_a_number(fit):
+def test_a_refit_that_does_not_converge_is_nan(fit):
     far = dataclasses.replace(sj.identify.FitInputs.none(fit), force=jnp.full(45, jnp.inf))
     assert np.isnan(sj.identify.refit(fit, far).modal_damping(1e-3))
 
 
-def test_smooth_curves_have_influences_of_their_roughness():
+def test_smooth_curves_have_an_influence_of_their_roughness():
     fit = sj.fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01)
     rough = values_at_displacement(fit, AT).slopes @ sj.identify.influence(fit).by.roughness
     assert rough.shape == (5, 2, 2)

@@ -1,4 +1,4 @@
-"""Uncertainty of a joint fit: derivatives against refits, and its ways against each other."""
+"""Uncertainty of a joint fit: contributions in closed form, and the bootstrap."""
 
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ def test_contributions_sum_to_one_and_name_the_level_errors(fit):
     assert sum(row.damping_fraction for row in rows) == pytest.approx(1, abs=1e-6)
     # Levels are named as the data name them: here from 0 to 4.
     assert {row.source for row in rows} >= {"random error of phase", "gain of level 4"}
-    # At resonance a level's gain counts as the velocities of its nine states do together; states
-    # off resonance tell it, since stiffness against frequency has the same factor.
+    # At resonance a level gain counts as much as the velocities of its nine states together; states
+    # off resonance determine it, since it scales stiffness against frequency too.
     near = contributions(sj.fit_jointly(noisy(1, widest=4), modes(), level_gain_std=0.01, **TRUE))
     at_resonance, off_it = (
         sum(row.damping_fraction for row in found if row.source.startswith("gain"))
@@ -51,23 +51,25 @@ def test_contributions_near_resonance_of_a_linear_mode_are_known(levels):
     fit = sj.fit_jointly(data, structure, backbone="polynomial:0", damping="constant")
     fractions = {row.source.removeprefix("random error of "): row for row in contributions(fit)}
     values = sj.identify.fitted_values(fit, np.array([1.0]))
-    lost = float((values.modal_damping_std / values.modal_damping)[0]) ** 2
-    moved = float((values.natural_frequency_std / values.natural_frequency)[0]) ** 2
-    # The stated noise is known to 10 %: bands have it as large as the states show it.
+    damping_variance = float((values.modal_damping_std / values.modal_damping)[0]) ** 2
+    frequency_variance = float((values.natural_frequency_std / values.natural_frequency)[0]) ** 2
+    # The stated noise is known to 10 %: bands use the estimate.
     found = np.asarray(fit.data.std)[0, :3]
     noise = dict(zip(("force", "velocity", "phase"), found, strict=True))
     assert noise["velocity"] == pytest.approx(NOISE["velocity"], rel=0.2)
-    # 2ζω = A F cos φ/v: the mean of all states has their errors' over √n. Shares are of the band
-    # itself, whatever levels add to it.
+    # 2ζω = A F cos φ/v: the mean of n states has their error over √n. Fractions are of the whole
+    # band, level errors included.
     for kind in ("velocity", "force"):
         wanted = noise[kind] ** 2 / n
-        assert fractions[kind].damping_fraction * lost == pytest.approx(wanted, rel=0.1)
-    # tan φ = (ω² − Ω²)/(Ω 2ζω): the natural frequency hinges on the phase, by half a bandwidth.
+        assert fractions[kind].damping_fraction * damping_variance == pytest.approx(wanted, rel=0.1)
+    # tan φ = (ω² − Ω²)/(Ω 2ζω): phase errors shift the frequency by half a bandwidth per rad.
     by_phase = (noise["phase"] * 0.5 * constant / OMEGA) ** 2 / n
-    assert fractions["phase"].frequency_fraction * moved == pytest.approx(by_phase, rel=0.1)
+    assert fractions["phase"].frequency_fraction * frequency_variance == pytest.approx(
+        by_phase, rel=0.1
+    )
     if levels:
-        # Of weighted means, to first order in tan φ: across, errors count as its mean square. How
-        # curves go with the forcing frequency, which is not known, takes a little of it.
+        # Weighted means, to first order in tan φ: cross terms scale with its mean square. The
+        # frequency exponents, which are unknowns, absorb a little of it.
         across, along = noise["phase"] ** 2, noise["velocity"] ** 2 + noise["force"] ** 2
         tilt = np.mean(tangent**2) * along**2 / (across * noise["velocity"] ** 2)
         ratio = fractions["phase"].damping_fraction / fractions["velocity"].damping_fraction
@@ -79,15 +81,15 @@ def test_contributions_near_resonance_of_a_linear_mode_are_known(levels):
         assert fractions["velocity"].damping_fraction + fractions["force"].damping_fraction < 0.5
 
 
-def test_the_bootstrap_knows_the_states_but_not_what_levels_share():
+def test_the_bootstrap_covers_state_errors_but_not_level_errors():
     independent = sj.fit_jointly(noisy(3, per_level=25), modes(), **TRUE)
-    drawn = bootstrap(independent, 40)
-    assert np.all(np.isfinite(drawn))
+    samples = bootstrap(independent, 40)
+    assert np.all(np.isfinite(samples))
     covariance, n = independent.covariance, 4  # the curves' own parameters come first
     across = covariance[:n, n:]
     given = covariance[:n, :n] - across @ np.linalg.pinv(covariance[n:, n:]) @ across.T
-    ratio = np.std(drawn[:, :n], axis=0) / np.sqrt(np.diag(given))
-    # 40 draws know a spread to 11 %, drawing 25 states a level adds as much. Levels that are known
-    # give the least spread, their errors' stated and estimated sizes the most.
+    ratio = np.std(samples[:, :n], axis=0) / np.sqrt(np.diag(given))
+    # 40 draws determine a standard deviation to 11 %; resampling 25 states a level adds as much.
+    # The spread with known level errors is the least, that with their prior the most.
     assert np.all(ratio > 0.8)
-    assert np.all(np.std(drawn[:, :n], axis=0) < np.sqrt(np.diag(covariance))[:n])
+    assert np.all(np.std(samples[:, :n], axis=0) < np.sqrt(np.diag(covariance))[:n])

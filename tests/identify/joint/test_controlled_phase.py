@@ -8,12 +8,12 @@ import snrmjax as sj
 HZ, RATIO, MASS = 80.0, 0.002, 1.0
 
 
-def softer(x):
-    """Natural frequency over the linear one, by the amplitude over the largest."""
+def frequency_ratio(x):
+    """Natural frequency over the linear one; x is the amplitude over the largest."""
     return 1 - 0.003 * x**2
 
 
-def lossier(x):
+def damping_ratio_factor(x):
     """Damping ratio over the linear one."""
     return 1 + 1.5 * x
 
@@ -21,13 +21,13 @@ def lossier(x):
 def about_resonance(scatter, spread, seed, noise=3e-4):
     """A model, and states of one level whose phases lie within `spread` (rad) of resonance.
 
-    ω̃² scatters by twice `scatter`, relative; the phase stays: Ω solves K − Ω² = Ωδ tan φ.
+    ω̃² scatters by twice `scatter`, relative, at fixed phase: Ω solves K − Ω² = Ωδ tan φ.
     """
     rng, n = np.random.default_rng(seed), 30
     x = np.geomspace(0.1, 1.0, n)
-    own = 2 * np.pi * HZ * softer(x)
+    own = 2 * np.pi * HZ * frequency_ratio(x)
     stiffness = own**2 * (1 + 2 * scatter * rng.normal(size=n))
-    damping = 2 * RATIO * lossier(x) * own
+    damping = 2 * RATIO * damping_ratio_factor(x) * own
     half = 0.5 * damping * np.tan(spread * rng.uniform(-1, 1, n))
     omega = np.sqrt(stiffness + half**2) - half
     amplitude = 1e-4 * x
@@ -44,8 +44,8 @@ def at_resonance(scatter, damped=0.01, levels=3, seed=1):
     rng = np.random.default_rng(seed)
     x = np.tile(np.geomspace(0.03, 1.0, 40), levels) * np.repeat(rng.uniform(0.97, 1.0, levels), 40)
     velocity = 0.064 * x
-    omega = 2 * np.pi * HZ * softer(x)
-    ratio = RATIO * lossier(x) * (1 + damped * rng.normal(size=x.size))
+    omega = 2 * np.pi * HZ * frequency_ratio(x)
+    ratio = RATIO * damping_ratio_factor(x) * (1 + damped * rng.normal(size=x.size))
     force = 2 * ratio * omega * MASS * velocity
     recorded = omega * (1 + scatter * rng.normal(size=x.size))
     level = np.repeat(np.arange(levels) + 1, 40)
@@ -64,12 +64,14 @@ def test_scatter_of_the_frequency_changes_neither_mass_nor_damping(scatter):
     x = np.geomspace(0.05, 0.95, 20)
     speed = 0.064 * x
     squared, modal = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
-    omega = 2 * np.pi * HZ * softer(x)
-    frequency, lost = np.sqrt(squared(speed / omega)), np.asarray(modal(speed / omega))
-    # 1 % of damping scatter over 120 states, a curve of some six numbers: 0.3 %.
-    np.testing.assert_allclose(lost / (2 * frequency), RATIO * lossier(x), rtol=0.02)
+    omega = 2 * np.pi * HZ * frequency_ratio(x)
+    frequency, modal_damping = np.sqrt(squared(speed / omega)), np.asarray(modal(speed / omega))
+    # 1 % of damping scatter, 120 states, a curve with some six degrees of freedom: 0.3 %.
     np.testing.assert_allclose(
-        frequency / (2 * np.pi), HZ * softer(x), atol=HZ * (0.6 * scatter + 1e-5)
+        modal_damping / (2 * frequency), RATIO * damping_ratio_factor(x), rtol=0.02
+    )
+    np.testing.assert_allclose(
+        frequency / (2 * np.pi), HZ * frequency_ratio(x), atol=HZ * (0.6 * scatter + 1e-5)
     )
 
 
@@ -77,8 +79,8 @@ def test_scatter_of_the_frequency_changes_neither_mass_nor_damping(scatter):
     ("scatter", "spread", "seed"),
     [(1e-4, 3, 0), (1e-4, 3, 2), (1e-3, 5, 2), (1e-3, 5, 4), (1e-3, 20, 1), (0.0, 20, 1)],
 )
-def test_phases_that_are_kept_loosely_change_neither_mass_nor_damping(scatter, spread, seed):
-    """Scatter that was taken for noise of the phase made ζ 9 to 700 % too large.
+def test_loosely_controlled_phases_change_neither_mass_nor_damping(scatter, spread, seed):
+    """Scatter treated as phase noise made ζ 9 to 700 % too large.
 
     The check then named rms amplitudes, other units or volts.
     """
@@ -86,15 +88,17 @@ def test_phases_that_are_kept_loosely_change_neither_mass_nor_damping(scatter, s
     fit = sj.fit_jointly(data, model)
     assert fit.modes_found.participation == pytest.approx(model.modes.participation)
     x = np.geomspace(0.12, 0.95, 20)
-    omega = 2 * np.pi * HZ * softer(x)
+    omega = 2 * np.pi * HZ * frequency_ratio(x)
     found = sj.identify.fitted_values(fit, 1e-4 * x * omega)
-    # 3e-4 of 30 states, of which a curve takes some six: 1.3e-4; and ω̃ scatters by `scatter`.
-    np.testing.assert_allclose(found.damping_ratio, RATIO * lossier(x), rtol=2e-3 + 4 * scatter)
+    # 3e-4, 30 states, some six degrees of freedom: 1.3e-4; and ω̃ scatters by `scatter`.
+    np.testing.assert_allclose(
+        found.damping_ratio, RATIO * damping_ratio_factor(x), rtol=2e-3 + 4 * scatter
+    )
     np.testing.assert_allclose(found.natural_frequency, omega, rtol=1e-5 + scatter)
     assert not sj.doctor.check_test(data, model).findings
 
 
-def test_what_is_missing_is_found_from_phase_resonances():
+def test_a_missing_effect_is_diagnosed_from_phase_resonances():
     model, data = at_resonance(2e-5)
     found = sj.diagnose_model(model, data)
     named = {part.part: part for part in found.parts}
@@ -102,6 +106,6 @@ def test_what_is_missing_is_found_from_phase_resonances():
     assert named["instrument"].effects == ()
 
 
-def test_phase_resonances_are_no_error_of_units():
+def test_phase_resonances_raise_no_unit_finding():
     model, data = at_resonance(1e-4)
     assert not sj.doctor.check_test(data, model).findings

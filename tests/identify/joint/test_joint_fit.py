@@ -1,4 +1,4 @@
-"""The joint fit against states that obey known curves, and its words where data do not suffice."""
+"""The joint fit against states on known curves, and its notes where data do not suffice."""
 
 import json
 
@@ -44,18 +44,18 @@ from snrmjax.io.joint_results import (
 )
 
 SPEEDS = np.linspace(0.2, 0.9, 8)
-# Levels that differ in nothing but their gain.
+# Level errors of the gain only.
 ALIKE = {"level_phase_std": 1e-9, "level_frequency_std": 1e-7, "level_damping_std": 1e-11}
 
 
 def kinds(fit):
-    """The kinds of what a fit has to tell."""
+    """The kinds of a fit's notes."""
     return {one.kind for one in fit.notes}
 
 
 @pytest.fixture(scope="module")
 def fit():
-    """A fit of noisy states with errors of levels."""
+    """A fit of noisy states with level errors."""
     return noisy_fit()
 
 
@@ -65,24 +65,24 @@ def test_a_structure_states_the_errors_of_its_levels(fit):
     np.testing.assert_array_equal(found.covariance, fit.covariance)
 
 
-def test_stated_differences_of_frequency_and_damping_between_levels_reach_the_fit():
+def test_stated_level_errors_of_frequency_and_damping_enter_the_fit():
     """At 500 rad/s, 1σ of 1 rad/s is 0.4 % of the stiffness; 0.0006 of 0.012 is 5 %."""
     model = sj.model.structure(modes(), level_frequency_std=1.0, level_damping_std=6e-4)
     found = fit_jointly(noisy(2), model, **TRUE)
     np.testing.assert_allclose(found.prior.new_level[2:], [0.004, 0.05], rtol=1e-12)
     plain = fit_jointly(noisy(2), modes(), **TRUE)
     wide, narrow = (sj.identify.fitted_values(f, SPEEDS) for f in (found, plain))
-    # In the middle of the amplitudes the curve is the mean of five levels of 1 rad/s each.
+    # In mid-range the curve averages five levels of 1 rad/s each.
     middle = np.min(np.asarray(wide.natural_frequency_std))
     assert middle == pytest.approx(1 / np.sqrt(5), rel=0.1)
-    # Nobody states it there: what levels may differ by is known from the states alone.
+    # Unstated level errors are estimated from the states alone.
     assert np.all(np.asarray(narrow.natural_frequency_std) < 0.7 / np.sqrt(5))
     stiff = sj.model.linear_modes([OMEGA], [0.0], [[2.0]], [3.0])
     with pytest.raises(ValueError, match="level_damping_std"):
         fit_jointly(noisy(2), sj.model.structure(stiff, level_damping_std=1e-3), **TRUE)
 
 
-def test_exact_states_give_back_the_curves():
+def test_exact_states_reproduce_the_curves():
     found = exact_fit()
     values = sj.identify.fitted_values(found, SPEEDS)
     want = truth_at(SPEEDS)
@@ -96,17 +96,17 @@ def test_exact_states_give_back_the_curves():
 def test_the_curves_are_those_of_the_orthogonal_distance_fit():
     """SciPy on the records themselves: every state's true displacement is one more unknown."""
     data = noisy(1, gain=0.01)
-    # Levels that differ in nothing but their gain, as SciPy's do.
+    # Level errors of the gain only, as in the SciPy model.
     fit = fit_jointly(data, sj.model.structure(modes(), level_gain_std=0.01, **ALIKE), **TRUE)
     level, omega, force = (np.asarray(a) for a in (data.level, data.frequency, data.force))
     velocity = np.asarray(data.velocity)[:, 0]
     recorded, largest = np.abs(velocity) / omega, fit.unknowns.squared_frequency.scale
     fast = fit.unknowns.modal_damping.scale
     unit = np.concatenate([np.full(2, OMEGA**2), np.full(2, 10.0), np.full(LEVELS, 0.01)])
-    # How both curves go with the forcing frequency is not known, and how large the noise is to 10 %
+    # The frequency exponents are unknowns, and the noise is known to 10 %.
     exponents = np.array(priors.OFF_RESONANCE)
     natural = omega**2 + (1j * omega * CONSTANT * force / velocity).real
-    away, of_noise = np.log(omega / np.sqrt(natural)), np.asarray(fit.data.std)[0, :3]
+    detuning, of_noise = np.log(omega / np.sqrt(natural)), np.asarray(fit.data.std)[0, :3]
     assert of_noise / [NOISE[one] for one in ("force", "velocity", "phase")] == pytest.approx(
         of_noise[0] / NOISE["force"], rel=1e-9
     )
@@ -114,9 +114,11 @@ def test_the_curves_are_those_of_the_orthogonal_distance_fit():
 
     def errors(point):
         (a, b, c, d, *gain), x = unit * point[:9], recorded * np.exp(velocity_std * point[11:])
-        softer, faster = exponents * point[9:11]
-        stiffness = a + b * (x / largest) ** 2 * (1 + softer * away) - omega**2
-        needed = stiffness + 1j * omega * (c + d * x * omega / fast) * (1 + faster * away)
+        stiffness_exponent, damping_exponent = exponents * point[9:11]
+        stiffness = a + b * (x / largest) ** 2 * (1 + stiffness_exponent * detuning) - omega**2
+        needed = stiffness + 1j * omega * (c + d * x * omega / fast) * (
+            1 + damping_exponent * detuning
+        )
         return np.concatenate(
             [
                 point[11:] + np.array(gain)[level] / velocity_std,
@@ -132,11 +134,11 @@ def test_the_curves_are_those_of_the_orthogonal_distance_fit():
     best = least_squares(errors, start, x_scale="jac")
     std = np.sqrt(np.diag(fit.covariance))[:4]
     assert best.success
-    # The noise of a per cent curves the balance: slopes taken at the records miss by 0.2.
+    # With 1 % noise, slopes at the uncorrected records would be off by 0.2.
     assert np.max(np.abs(unit[:4] * best.x[:4] - found[:4]) / std) < 0.02
 
 
-def test_gain_offset_and_phase_of_the_instruments_are_found():
+def test_gain_offset_and_phase_of_the_instruments_are_estimated():
     level, omega, force, velocity = exact()
     gain, offset, phase = 0.4, 0.02, np.radians(5.0)
     volts = (force - offset) / gain
@@ -173,7 +175,7 @@ def test_bands_are_as_wide_as_the_scatter_of_repeated_tests():
         second = (values.modal_damping - want[1]) / values.modal_damping_std
         z.append(np.stack([first, second]))
     z = np.array(z)
-    # Neighbouring amplitudes err together: about three independent ones a curve.
+    # Errors of neighbouring amplitudes are correlated: about three independent per curve.
     independent = 3 * tests
     assert np.all(np.abs(z.mean(axis=(0, 2))) < 3 / np.sqrt(independent))
     rms = np.sqrt(np.mean(z**2, axis=(0, 2)))
@@ -197,7 +199,7 @@ def test_without_the_levels_error_bands_are_too_narrow():
     assert np.all(np.asarray(narrow) < 0.9 * np.asarray(wide))
 
 
-def test_spare_states_and_levels_tell_nothing(fit):
+def test_padding_states_and_levels_carry_no_information(fit):
     n, room = len(fit.data.level), padded_problem(fit.problem)
     assert len(room.data.level) > n
     assert room.data.n_levels > fit.data.n_levels
@@ -206,7 +208,7 @@ def test_spare_states_and_levels_tell_nothing(fit):
     for mine, own in zip(found, whitened_slopes(alone, fit.problem, n), strict=True):
         np.testing.assert_allclose(mine, own, atol=1e-12 * np.abs(own).max())
     assert found[0].shape == (n, 2, len(fit.names()))
-    # Whitened by the errors that states have.
+    # Whitened by the states' errors.
     scaled = found[1] * np.asarray(fit.data.std)[:, None, :]
     unit = np.broadcast_to(np.eye(2), (n, 2, 2))
     np.testing.assert_allclose(scaled @ np.swapaxes(scaled, 1, 2), unit, atol=1e-9)
@@ -218,8 +220,8 @@ def test_order_of_rows_and_units_do_not_matter(fit):
     mixed = stated(level[order], omega[order], force[order], velocity[order])
     again = fit_jointly(mixed, modes(), level_gain_std=0.01, **TRUE)
     values, others = (sj.identify.fitted_values(f, SPEEDS) for f in (fit, again))
-    # The stated noise is that of the exact magnitudes in one and of the noisy in the other: the
-    # same numbers here, so only rounding and where both searches end remain.
+    # The stated noise is relative to the exact magnitudes in one and to the noisy in the other: the
+    # same numbers here, so only rounding and convergence tolerance remain.
     np.testing.assert_allclose(others.natural_frequency, values.natural_frequency, rtol=1e-6)
     np.testing.assert_allclose(others.modal_damping_std, values.modal_damping_std, rtol=1e-2)
     in_mm = sj.model.linear_modes([500.0], [0.012], [[2000.0]], [3.0])
@@ -233,7 +235,7 @@ def _columns(data):
     return data.level, data.frequency, data.force, data.velocity[:, 0]
 
 
-def test_noise_that_residuals_contradict_is_said_and_widens_the_bands():
+def test_exceeded_noise_is_reported_and_widens_the_bands():
     quiet = fit_jointly(noisy(2), modes(), **TRUE)
     loud = fit_jointly(noisy(2, scale=3.0), modes(), **TRUE)
     assert abs(quiet.noise.scale - 1) < 3 * quiet.noise.scale_std
@@ -243,24 +245,24 @@ def test_noise_that_residuals_contradict_is_said_and_widens_the_bands():
     ratio = sj.identify.fitted_values(loud, SPEEDS).modal_damping_std / (
         sj.identify.fitted_values(quiet, SPEEDS).modal_damping_std
     )
-    # The noise is known to a tenth; below it levels may differ by more than below the quiet one.
+    # The noise is known to a tenth, and larger noise hides larger level errors.
     assert np.all((ratio > 3.0 * 0.75) & (ratio < 9.0))
     silent = fit_jointly(noisy(2, scale=0.3), modes(), **TRUE)
     assert "noise_overstated" in kinds(silent)
 
 
-def test_noise_that_nobody_states_is_found():
+def test_unstated_noise_is_estimated():
     level, omega, force, velocity = (np.asarray(part) for part in _columns(noisy(4)))
     found = fit_jointly(sj.measure.steady_states(level, omega, force, velocity), modes(), **TRUE)
-    # One relative error stands for those of velocity, phase and force, larger off resonance.
+    # One relative error for velocity, phase and force, larger off resonance.
     assert 0.3 * NOISE["velocity"] < found.noise.scale < 1.5 * NOISE["velocity"]
     assert not found.noise.stated
 
 
 @pytest.mark.long
-def test_levels_that_do_not_scatter_are_not_said_to():
-    # Curves that the rough start cannot follow must not pass for levels that differ. Four kinds of
-    # error are tried at 1 % each: of ten tests, three with a find would be a draw in 150.
+def test_levels_without_scatter_are_not_reported():
+    # Misfit of the initial curves must not be taken for level errors. Four kinds of error are
+    # tested at 1 % each: three detections in ten tests have a probability of 1 in 150.
     found = 0
     for seed in range(10):
         fit = fit_jointly(noisy(seed, per_level=25), modes())
@@ -268,18 +270,18 @@ def test_levels_that_do_not_scatter_are_not_said_to():
     assert found <= 2
 
 
-def test_levels_that_scatter_are_found_and_enter_the_bands():
+def test_level_scatter_is_estimated_and_enters_the_bands():
     level, omega, _, velocity = exact()
     rng = np.random.default_rng(8)
     shift = 0.004 * rng.normal(size=LEVELS)[level]
-    # A stiffness that differs by level: the same motion needs another force and has another phase.
+    # A level error of the stiffness: the same motion needs another force at another phase.
     x = np.abs(velocity) / omega
     needed = squared(x) * (1 + shift) - omega**2 + 1j * omega * damping(np.abs(velocity))
     moved = np.abs(needed) * x / 6.0
-    turned = 1j * omega * 6.0 * moved / needed
+    phasor = 1j * omega * 6.0 * moved / needed
     own = np.exp(0.01 * rng.normal(size=len(level)) + 0.012j * rng.normal(size=len(level)))
-    found = fit_jointly(stated(level, omega, moved, turned * own), modes(), **TRUE)
-    # Five levels: 1σ of their spread is known to about a third.
+    found = fit_jointly(stated(level, omega, moved, phasor * own), modes(), **TRUE)
+    # The 1σ of five levels is known to about a third.
     assert 0.4 < found.noise.level_std[2] / 0.004 < 2.0
     assert "levels_differ" in kinds(found)
     steady = fit_jointly(noisy(8), modes(), **TRUE)
@@ -290,7 +292,7 @@ def test_levels_that_scatter_are_found_and_enter_the_bands():
     assert np.all(np.asarray(wide) > np.asarray(narrow))
 
 
-def test_two_levels_whose_gains_differ_are_found_to():
+def test_two_levels_with_different_gains_are_detected():
     level, omega, force, velocity = exact()
     two = level >= LEVELS - 2
     level, omega, force, velocity = (a[two] for a in (level, omega, force, velocity))
@@ -308,7 +310,7 @@ def test_two_levels_whose_gains_differ_are_found_to():
         return np.max(np.abs(off / (2 * values.natural_frequency * values.natural_frequency_std)))
 
     found = fitted(gain)
-    # Two gains 10 % apart are draws of one population of 10 %/√2, if of any.
+    # Two gains 10 % apart have a sample standard deviation of 10 %/√2.
     assert found.noise.level_std[0] == pytest.approx(0.1 / np.sqrt(2), rel=0.3)
     assert "few_levels" in kinds(found)
     # Student's t of two degrees of freedom: 4.303 where a normal has 1.960.
@@ -327,24 +329,24 @@ def test_auto_is_smooth_and_holds_the_truth():
     assert np.max(np.abs(off / np.asarray(values.natural_frequency_std))) < 4
 
 
-def test_the_simplest_size_in_the_band_is_taken():
-    """ω̃² = ω²(1 + (x/x₀)²) takes one term beside the constant; damping grows with velocity."""
+def test_the_simplest_order_in_the_band_is_selected():
+    """ω̃² = ω²(1 + (x/x₀)²) takes one term plus a constant; damping grows with velocity."""
     named = {"backbone": "polynomial", "damping": "viscous_quadratic"}
     found = fit_jointly(noisy(3, gain=0.01), modes(), level_gain_std=0.01, **named)
     assert found.unknowns.squared_frequency.label == "polynomial:1@displacement"
 
 
-def test_a_smooth_curve_has_as_many_knots_as_were_asked_for():
+def test_a_smooth_curve_has_the_requested_knots():
     found = fit_jointly(noisy(3), modes(), backbone="smoothing_spline:9", damping="auto")
     assert found.unknowns.squared_frequency.label == "smoothing_spline:9@displacement"
     again = fit_jointly(noisy(3), modes(), backbone=found.unknowns.squared_frequency.label)
     assert again.unknowns.squared_frequency.label == found.unknowns.squared_frequency.label
-    with pytest.raises(ValueError, match="one size, not 5 and 9"):
+    with pytest.raises(ValueError, match="the same number, not 5 and 9"):
         fit_jointly(noisy(3), modes(), backbone="smoothing_spline:9", damping="smoothing_spline:5")
 
 
-def test_an_exponent_at_the_end_of_its_range_leaves_the_bands_alone():
-    # The law is a power of one, the largest that microslip may have; this noise asks for more.
+def test_an_exponent_at_its_bound_does_not_inflate_the_bands():
+    # The true power is one, the upper bound of microslip; this noise favours a larger one.
     data = noisy(3, gain=0.01)
     free, fixed = (
         fit_jointly(data, modes(), level_gain_std=0.01, **{**TRUE, "damping": damping})
@@ -355,12 +357,12 @@ def test_an_exponent_at_the_end_of_its_range_leaves_the_bands_alone():
     ratio = np.asarray(wide.natural_frequency_std / narrow.natural_frequency_std)
     assert np.all((ratio > 0.99) & (ratio < 1.1))
     ratio = np.asarray(wide.modal_damping_std / narrow.modal_damping_std)
-    assert np.all((ratio > 0.99) & (ratio < 1.7))  # what an exponent more does where data are few
+    assert np.all((ratio > 0.99) & (ratio < 1.7))  # one more parameter where data are few
     off = (wide.modal_damping - narrow.modal_damping) / narrow.modal_damping_std
     assert np.max(np.abs(off)) < 0.5
 
 
-def test_a_robust_loss_shrugs_off_an_outlier():
+def test_a_robust_loss_ignores_an_outlier():
     level, omega, force, velocity = (np.asarray(part) for part in _columns(noisy(5)))
     force = force.copy()
     force[13] *= 1.3
@@ -386,12 +388,12 @@ def test_a_robust_loss_shrugs_off_an_outlier():
         ({"backbone": "spline:60", "damping": "spline:60"}, "states"),
     ],
 )
-def test_wrong_settings_are_said(change, message):
+def test_wrong_settings_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         fit_jointly(noisy(1), modes(), **{**TRUE, **change})
 
 
-def test_too_few_states_and_one_level_are_said():
+def test_too_few_states_are_refused_and_one_level_is_noted():
     level, omega, force, velocity = (np.asarray(part) for part in _columns(noisy(1)))
     with pytest.raises(ValueError, match="at least 3"):
         fit_jointly(stated(level[:2], omega[:2], force[:2], velocity[:2]), modes(), **TRUE)
@@ -399,16 +401,16 @@ def test_too_few_states_and_one_level_are_said():
     data = stated(level[one], omega[one], force[one], velocity[one])
     found = fit_jointly(data, modes(), backbone="polynomial:1", damping="constant")
     (note,) = (one for one in found.notes if one.kind == "few_levels")
-    # Student's t of two degrees of freedom, as for two levels, on what is likely beforehand.
+    # Student's t of two degrees of freedom, as for two levels, times the prior scale.
     assert note["assumed"] == pytest.approx(
         [4.303 / 1.960 * prior.scale for prior in priors.LEVELS], rel=1e-2
     )
-    # A level's own error of damping is in the band: no state of that level alone shows it.
+    # The band includes the level error of damping, which one level cannot show.
     values = sj.identify.fitted_values(found, np.array([found.largest[1]]))
     assert values.damping_ratio_std / values.damping_ratio > 0.98 * note["assumed"][3]
 
 
-def test_states_on_one_side_and_levels_of_one_amplitude_are_said():
+def test_states_on_one_side_and_levels_of_one_amplitude_are_noted():
     level, omega, force, velocity = (np.asarray(part) for part in _columns(noisy(1)))
     families = {"backbone": "polynomial:1", "damping": "polynomial:1"}
 
@@ -425,18 +427,18 @@ def test_states_on_one_side_and_levels_of_one_amplitude_are_said():
 
 
 @pytest.mark.parametrize("families", [TRUE, pytest.param({}, marks=pytest.mark.long)])
-def test_noise_far_above_the_stated_one_leads_nowhere_else(families):
-    """Errors of 8 % and 5°, stated as an eighth of that: records are corrected all the same."""
-    doubted = fit_jointly(noisy(2, scale=8.0), modes(), **families)
-    values, want = sj.identify.fitted_values(doubted, SPEEDS), truth_at(SPEEDS)
+def test_noise_far_above_the_stated_one_does_not_bias_the_fit(families):
+    """Errors of 8 % and 5°, stated as an eighth of that: records are corrected nevertheless."""
+    understated = fit_jointly(noisy(2, scale=8.0), modes(), **families)
+    values, want = sj.identify.fitted_values(understated, SPEEDS), truth_at(SPEEDS)
     off = np.asarray(values.natural_frequency - np.sqrt(want[0])) / values.natural_frequency_std
     assert np.max(np.abs(off)) < 3
     off = np.asarray(values.modal_damping - want[1]) / values.modal_damping_std
     assert np.max(np.abs(off)) < 3
 
 
-def test_what_is_open_of_other_modes_is_in_the_bands_and_moves_no_exact_curve():
-    """A second mode beside the nonlinear one, its frequency and damping with a stated 1σ."""
+def test_uncertain_other_modes_widen_the_bands_and_leave_exact_curves():
+    """A second, linear mode, its frequency and damping with a stated 1σ."""
 
     def two(std):
         return sj.model.linear_modes(
@@ -446,22 +448,24 @@ def test_what_is_open_of_other_modes_is_in_the_bands_and_moves_no_exact_curve():
     level, omega, force, velocity = exact()
     other = np.asarray(sj.model.residual_velocity(two(None), jnp.asarray(omega), force))[:, 0]
     data = stated(level, omega, force, velocity + other)
-    known, told = (
+    known, uncertain = (
         fit_jointly(data, two(std), level_gain_std=0.01)
         for std in (None, sj.model.LinearModesStd([0.0, 300.0], [0.0, 0.0]))
     )
     alone = fit_jointly(stated(level, omega, force, velocity), modes(), level_gain_std=0.01)
-    own, values, wide = (sj.identify.fitted_values(fit, SPEEDS) for fit in (alone, known, told))
+    own, values, wide = (
+        sj.identify.fitted_values(fit, SPEEDS) for fit in (alone, known, uncertain)
+    )
     for name in ("natural_frequency", "modal_damping"):
         without = np.asarray(getattr(own, name))
-        # The stated errors of magnitudes that hold another mode are other ones.
+        # Stated relative errors are of magnitudes that include the other mode.
         for found, most in ((values, 0.05), (wide, 0.3)):
             off = np.asarray(getattr(found, name)) - without
             assert np.max(np.abs(off / np.asarray(getattr(found, f"{name}_std")))) < most
-    # Its flexibility moves the natural frequency, if its own frequency is a fifth off.
+    # An error of a fifth of its frequency changes its flexibility, and so the natural frequency.
     assert np.max(wide.natural_frequency_std / values.natural_frequency_std) > 1.02
-    place = told.names().index("linear_0")
-    assert 0 < told.covariance[place, place] <= 1 + 1e-9
+    index = uncertain.names().index("linear_0")
+    assert 0 < uncertain.covariance[index, index] <= 1 + 1e-9
 
 
 def test_parse_family():
@@ -469,7 +473,7 @@ def test_parse_family():
     assert parse_family("auto") == ("auto", None, None)
 
 
-def test_a_fit_comes_back_from_its_file(fit, tmp_path):
+def test_a_fit_round_trips_through_its_file(fit, tmp_path):
     write_joint_fit(tmp_path / "fit.json", fit)
     again = read_joint_fit(tmp_path / "fit.json")
     assert again.names() == fit.names()
@@ -479,7 +483,7 @@ def test_a_fit_comes_back_from_its_file(fit, tmp_path):
     for first, second in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(first, second)
     other = json.loads((tmp_path / "fit.json").read_text())
-    other["fit"]["class"] = "os:PathLike"  # a file makes nothing but what a fit is made of
+    other["fit"]["class"] = "os:PathLike"  # a file can only construct the parts of a fit
     (tmp_path / "other.json").write_text(json.dumps(other))
     with pytest.raises(ValueError, match="not made of"):
         read_joint_fit(tmp_path / "other.json")

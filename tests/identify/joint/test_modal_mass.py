@@ -1,4 +1,4 @@
-"""A modal mass that the model has wrong, on states whose mass is known."""
+"""A wrong modal mass in the model, on states of known modal mass."""
 
 import dataclasses
 from pathlib import Path
@@ -39,12 +39,12 @@ def fit():
     return sj.fit_jointly(noisy(3, gain=0.003), wrong_modes(), level_gain_std=0.003, **TRUE)
 
 
-def test_states_away_from_resonance_tell_it(fit):
-    told = summarise_fit(fit, ())["modal_mass"]
-    assert told["found"]
-    assert told["model_kg"] == pytest.approx(WRONG / CONSTANT, rel=1e-12)
-    assert abs(told["value_kg"] - 1 / CONSTANT) < 2.5 * told["std_kg"]
-    assert told["std_kg"] < 0.02 / CONSTANT
+def test_states_off_resonance_determine_it(fit):
+    summary = summarise_fit(fit, ())["modal_mass"]
+    assert summary["found"]
+    assert summary["model_kg"] == pytest.approx(WRONG / CONSTANT, rel=1e-12)
+    assert abs(summary["value_kg"] - 1 / CONSTANT) < 2.5 * summary["std_kg"]
+    assert summary["std_kg"] < 0.02 / CONSTANT
     (note,) = (note for note in fit.notes if note.kind == "modal_mass_moved")
     assert note["model_std"] == 0.05
 
@@ -56,13 +56,13 @@ def test_curves_are_relative_to_it(fit):
         (values.modal_damping - want[1]) / values.modal_damping_std,
     ]
     assert np.max(np.abs(z)) < 3
-    # With the model's mass damping is wrong by 6 %, the mass's whole error.
+    # With the model's mass the damping would be off by its full error of 6 %.
     assert np.max(np.abs(values.modal_damping / want[1] - 1)) < 0.03
 
 
-def test_predictions_and_points_have_it_too(fit):
+def test_predictions_and_points_use_it(fit):
     (resonance,) = sj.identify.fitted_response(fit, 2.0)[0].resonances
-    # At phase resonance the damping's force is the whole: A F = 2ζ̃ω̃ v.
+    # At phase resonance the damping balances the force: A F = 2ζ̃ω̃ v.
     damping = truth_at(np.array([resonance.velocity]))[1]
     assert damping[0] * resonance.velocity == pytest.approx(2.0 * CONSTANT, rel=0.03)
     assert as_backbone(fit).modal_constant == pytest.approx(CONSTANT, rel=0.02)
@@ -71,12 +71,12 @@ def test_predictions_and_points_have_it_too(fit):
     points = identification_of_fit(noisy(3, gain=0.003), fit).points
     x = np.abs(np.asarray(points.mode_velocity)) / np.asarray(noisy(3, gain=0.003).frequency)
     ratio = np.asarray(points.natural_frequency) / np.sqrt(squared(x))
-    # States below and above resonance miss in opposite directions where the mass is wrong.
+    # A wrong mass shifts points below and above resonance in opposite directions.
     phase = np.angle(np.asarray(points.mode_velocity))
     assert abs(np.mean(ratio[phase > 0.5]) - np.mean(ratio[phase < -0.5])) < 3e-4
 
 
-def test_it_comes_back_from_its_file(fit, tmp_path):
+def test_it_round_trips_through_its_file(fit, tmp_path):
     write_joint_fit(tmp_path / "fit.json", fit)
     again = read_joint_fit(tmp_path / "fit.json")
     assert summarise_fit(again, ())["modal_mass"] == summarise_fit(fit, ())["modal_mass"]
@@ -86,7 +86,7 @@ def test_it_comes_back_from_its_file(fit, tmp_path):
     "case",
     ["stated to be exact", "near resonance", pytest.param("gain free", marks=pytest.mark.long)],
 )
-def test_where_nothing_tells_it_the_models_is_taken(case):
+def test_where_nothing_determines_it_the_models_is_used(case):
     data = noisy(3, gain=0.003)
     std = 0.0 if case == "stated to be exact" else None
     free = ["force_gain"] if case == "gain free" else []
@@ -94,13 +94,13 @@ def test_where_nothing_tells_it_the_models_is_taken(case):
         near = np.abs(np.angle(np.asarray(data.velocity)[:, 0])) < np.radians(3)
         data = data.select(near)
     found = sj.fit_jointly(data, wrong_modes(std), free=free, level_gain_std=0.003, **TRUE)
-    told = summarise_fit(found, ())["modal_mass"]
-    assert not told["found"]
-    assert told["value_kg"] == told["model_kg"]
+    summary = summarise_fit(found, ())["modal_mass"]
+    assert not summary["found"]
+    assert summary["value_kg"] == summary["model_kg"]
     assert not any(note.kind == "modal_mass_moved" for note in found.notes)
 
 
-def test_a_stated_error_is_kept_and_its_breach_said():
+def test_a_stated_error_is_respected_and_its_violation_noted():
     data = noisy(3, gain=0.003)
     wide = sj.fit_jointly(data, wrong_modes(0.04), level_gain_std=0.003, **TRUE)
     assert summarise_fit(wide, ())["modal_mass"]["found"]
@@ -126,7 +126,7 @@ def test_a_model_file_states_it(tmp_path):
 @pytest.mark.skipif(not MEASURED.exists(), reason="measured data are not there: ../shared/data")
 @pytest.mark.parametrize("free", [(), ("force_gain", "instrument_phase")])
 def test_no_gain_moves_the_measured_velocities_of_a_bolted_beam(free):
-    """Four levels of constant force, whose own phase resonances are read off without a method."""
+    """Four levels of constant force, whose phase resonances are interpolated directly."""
     model = sj.read_model(MEASURED / "model.toml")
     data = sj.read_steady_states(MEASURED / "force_controlled.csv", model)
     fit = sj.fit_jointly(data, model, free=free)
@@ -141,5 +141,5 @@ def test_no_gain_moves_the_measured_velocities_of_a_bolted_beam(free):
         resonances.append([np.interp(0.0, phase, column) for column in columns])
     at, frequency = np.array(resonances).T
     found = sj.identify.fitted_values(fit, at).natural_frequency
-    # Runs repeat to 0.1 Hz and more: 0.02 Hz was missed at most, 0.5 Hz with a gain free before.
+    # Runs repeat to 0.1 Hz; the largest difference was 0.02 Hz.
     np.testing.assert_allclose(found, frequency, atol=2 * np.pi * 0.03)

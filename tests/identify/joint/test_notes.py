@@ -1,4 +1,4 @@
-"""What a joint fit has to tell of its data."""
+"""Notes of a joint fit on its data."""
 
 import dataclasses
 
@@ -20,14 +20,14 @@ from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 from snrmjax.numerics.facts import Fact
 
 
-def test_noise_and_levels_beyond_what_is_stated_are_told():
+def test_noise_and_levels_beyond_the_stated_ones_are_noted():
     found = NoiseEstimate(15.0, 0.6, np.array([0.041, 0.0, 0.0, 0.0]), True)
     taken = np.array([0.05, 0.0, 0.01, 0.0])
     kinds = [one.kind for one in notes_on_noise(found, 1.8e-4, np.zeros(4), taken, 4)]
     assert kinds == ["noise_exceeded", "frequency_wanders", "levels_differ"]
     unstated = dataclasses.replace(found, stated=False)
     wanders, differ = notes_on_noise(unstated, 1.8e-4, np.zeros(4), taken, 4)
-    # The argument is final, whatever the noise.
+    # The given scatter is used, whatever the noise.
     assert wanders == Fact("frequency_wanders", std=1.8e-4, noise_stated=False)
     assert differ == Fact("levels_differ", std=(0.041, 0.0, 0.0, 0.0), beyond_stated=False)
     given = np.array([0.05, 0.05, 0.0, 0.0])
@@ -39,12 +39,12 @@ def test_noise_and_levels_beyond_what_is_stated_are_told():
 def test_parts_of_correlated_residuals_are_named():
     (note,) = notes_on_autocorrelation(np.array([0.92, 0.73]))
     assert (note["in_phase"], note["quadrature"]) == (0.92, 0.73)
-    # 1.92/0.08 = 24 points of a first-order process know as much as one.
+    # 1.92/0.08 = 24 points of a first-order process count as one.
     assert note["states_as_one"] == pytest.approx(24)
     assert notes_on_autocorrelation(np.zeros(2)) == []
 
 
-def test_what_a_fit_did_to_each_level_is_told():
+def test_level_corrections_are_noted():
     change = np.array([0.019, 0.031, 0.043, 0.067])
     found = np.zeros((4, 4))
     found[:, 0] = -np.log1p(change)  # a velocity that reads too low is scaled up
@@ -61,7 +61,7 @@ def test_what_a_fit_did_to_each_level_is_told():
 
 @pytest.fixture(scope="module")
 def numbered():
-    """A fit of levels that its file numbers 10, 20, …"""
+    """A fit of levels numbered 10, 20, … in the file."""
     plain = noisy(1, gain=0.01)
     data = sj.measure.steady_states(
         10 * (1 + np.asarray(plain.level)),
@@ -79,20 +79,20 @@ def test_levels_have_the_numbers_of_their_file(numbered, tmp_path):
     assert min(numbered.level_numbers) == 10
     assert "level_10.gain" in found["parameter"].values
     assert "gain of level 10" in {one.source for one in contributions(numbered)}
-    # What readers of the file rely on stays.
+    # Names by index stay, for other programs.
     assert "level_0.gain" in numbered.names()
     write_joint_fit(tmp_path / "fit.json", numbered)
     assert read_joint_fit(tmp_path / "fit.json").level_numbers == numbered.level_numbers
 
 
-def test_one_screen_speaks_in_words_and_per_cent():
+def test_the_repr_uses_words_and_per_cent():
     text = repr(noisy_fit())
     assert "damping: viscous and quadratic damping of velocity" in text
     assert "@" not in text.splitlines()[0]
 
 
 class TestStatedErrorsOfLevels:
-    def test_a_breach_and_a_common_shift_are_told(self):
+    def test_a_violation_and_a_common_shift_are_noted(self):
         deviation = np.zeros((5, 4))
         deviation[:, 0] = [3.8, 4.1, 4.0, 4.2, 3.9]
         (note,) = notes_on_stated_errors(deviation, np.array([0.005, 0, 0, 0]))
@@ -105,7 +105,7 @@ class TestStatedErrorsOfLevels:
         (note,) = notes_on_stated_errors(deviation, np.array([0.01, 0, 0, 0]))
         assert note["mean"] is None
 
-    def test_errors_as_stated_are_no_matter(self):
+    def test_errors_as_stated_are_not_noted(self):
         rng = np.random.default_rng(0)
         stated = np.array([0.01, 0.01, 0, 0])
         found = sum(

@@ -1,4 +1,4 @@
-"""The smoothing spline: its bends, their size, and bands that hold what lies between levels."""
+"""The smoothing spline: its roughness, and bands that cover the curve between levels."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,11 +18,11 @@ AT = np.linspace(3.2e-4, 1.95e-3, 40)  # m
 
 def curve(values, roughness_std=1.0):
     """A smoothing spline through values at `KNOTS`."""
-    drawn = SmoothingSpline.through(KNOTS, values, jnp.asarray(2.0), "displacement")
-    return SmoothingSpline(**(vars(drawn) | {"roughness_std": jnp.asarray(roughness_std)}))
+    spline = SmoothingSpline.through(KNOTS, values, jnp.asarray(2.0), "displacement")
+    return SmoothingSpline(**(vars(spline) | {"roughness_std": jnp.asarray(roughness_std)}))
 
 
-def test_a_straight_line_has_no_bends_and_a_corner_has_one():
+def test_a_straight_line_has_no_roughness_and_a_corner_has_one():
     line = curve(3.0 - 2.0 * KNOTS)
     np.testing.assert_allclose(line.prior_residuals(), 0.0, atol=1e-12)
     corner = np.asarray(curve(np.maximum(KNOTS - 0.3, 0.0)).prior_residuals())
@@ -37,7 +37,7 @@ def dipping(x):
 
 
 def near_resonance(seed, n_levels=14):
-    """Noisy states within 1.2° of resonance; the gain of a level errs by 1 %."""
+    """Noisy states within 1.2° of resonance; level gains have errors of 1 %."""
     rng = np.random.default_rng(seed)
     level = np.repeat(np.arange(n_levels), 6)
     phase = np.radians(np.tile(np.linspace(-1.2, 1.2, 6), n_levels))
@@ -59,7 +59,7 @@ def near_resonance(seed, n_levels=14):
 
 @pytest.fixture(scope="module")
 def fits():
-    """Noisy tests of a curve that few knots cannot follow, families chosen by the data."""
+    """Fits to noisy tests of a curve that few knots cannot follow."""
     return [
         fit_jointly(near_resonance(seed), modes(), level_gain_std=0.01)
         for seed in range(repeats(1, 12))
@@ -67,37 +67,37 @@ def fits():
 
 
 def inside(fit):
-    """Where the band of 95 % holds the curve."""
+    """Where the 95 % band covers the curve."""
     values = sj.identify.fitted_values(fit, displacement=AT)
     off = np.asarray(values.natural_frequency) - np.sqrt(dipping(AT))
     return np.abs(off / np.asarray(values.natural_frequency_std)) < 1.96
 
 
 @pytest.mark.long
-def test_bands_hold_a_curve_that_few_knots_cannot_follow(fits):
+def test_bands_cover_a_curve_that_few_knots_cannot_follow(fits):
     for fit in fits:
         curve = fit.unknowns.squared_frequency
         assert fit.converged
         assert isinstance(curve, SmoothingSpline)
-        # Knots are a tenth of the amplitude apart and the dip as wide: what the best curve through
-        # them misses of it passes for levels whose stiffness differs, and no more than that.
+        # Knots are a tenth of the amplitude apart and the dip as wide: the interpolation error of
+        # the best curve is fitted as level errors of the stiffness, and no more than that.
         scale, knots = float(curve.scale), np.asarray(curve.knots)
         best = CubicSpline(knots, dipping(scale * np.sqrt(knots)), bc_type="natural")
         missed = np.abs(best((AT / scale) ** 2) / dipping(AT) - 1).max()
         assert fit.noise.level_std[2] < missed < 0.03
-    # The gain of a level moves the curve beside it: all amplitudes of a test are off together, and
-    # twelve tests know the share to some 3 %.
+    # Level gains shift the curve near the level: errors of a test are correlated, and twelve tests
+    # determine the coverage to some 3 %.
     assert np.mean([inside(fit) for fit in fits]) > 0.9
     few = fit_jointly(
         near_resonance(0), modes(), level_gain_std=0.01, backbone="spline:4", damping="constant"
     )
-    # What four knots cannot follow is drawn, and a note says so.
+    # The remainder of four knots is fitted, and noted.
     assert "family_leaves" in {note.kind for note in few.notes}
     assert np.mean(inside(few)) > 0.9
 
 
 @pytest.mark.long
-def test_a_smoothing_spline_comes_back_from_its_file(fits, tmp_path):
+def test_a_smoothing_spline_round_trips_through_its_file(fits, tmp_path):
     write_joint_fit(tmp_path / "fit.json", fits[0])
     again = read_joint_fit(tmp_path / "fit.json")
     curve = fits[0].unknowns.squared_frequency

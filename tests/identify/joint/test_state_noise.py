@@ -1,4 +1,4 @@
-"""Noise with a floor, and errors of levels that run with their forces."""
+"""Noise with a floor, and level errors independent of the force."""
 
 import numpy as np
 import pytest
@@ -31,20 +31,20 @@ def state(force, phase):
     return frequency(amplitude), frequency(amplitude) * amplitude
 
 
-def rows_of_a_test(tips, turned, noise, floor, seed):
-    """Columns of a test: levels of these amplitudes at resonance (m), whose phases are `turned`."""
+def rows_of_a_test(tips, level_phase, noise, floor, seed):
+    """Columns of a test: levels of these amplitudes at resonance (m), with these phase errors."""
     rng = np.random.default_rng(seed)
     rows = [
-        (level, *state(force, phase), force, phase, turn)
-        for level, (tip, turn) in enumerate(zip(tips, turned, strict=True), start=1)
+        (level, *state(force, phase), force, phase, phase_error)
+        for level, (tip, phase_error) in enumerate(zip(tips, level_phase, strict=True), start=1)
         for force in [
             MASS * 2 * OWN * RATIO * OWN * tip * np.sqrt(1 - SOFTENING * (tip / LARGEST) ** 2)
         ]
         for phase in np.radians(np.linspace(65, -65, 15))
     ]
-    level, frequency, speed, force, phase, turn = np.array(rows).T
+    level, frequency, speed, force, phase, phase_error = np.array(rows).T
     own = rng.normal(size=(2, len(rows))) + 1j * rng.normal(size=(2, len(rows)))
-    velocity = speed * np.exp(1j * (phase + turn)) * (1 + noise * own[0]) + floor * own[1]
+    velocity = speed * np.exp(1j * (phase + phase_error)) * (1 + noise * own[0]) + floor * own[1]
     return level.astype(int), frequency, force, velocity
 
 
@@ -61,26 +61,26 @@ def errors_of(fit, tips):
     found = sj.identify.fitted_values(fit, tips * own)
     ratio = RATIO * OWN / own
     off = (found.natural_frequency - own) / found.natural_frequency_std
-    lossy = (found.damping_ratio - ratio) / found.damping_ratio_std
-    return np.array([off, lossy]), np.asarray(found.damping_ratio_std) / ratio
+    damping_error = (found.damping_ratio - ratio) / found.damping_ratio_std
+    return np.array([off, damping_error]), np.asarray(found.damping_ratio_std) / ratio
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_floor_of_the_noise_is_found_over_60_db(seed):
-    # 2 % of the lowest level's velocity and 0.002 % of the highest's; 0.2 % of every one's.
+def test_a_noise_floor_is_estimated_over_60_db(seed):
+    # Floor of 2 % of the lowest level's velocity, 0.002 % of the highest's; relative noise 0.2 %.
     tips = np.geomspace(1e-3, 1.0, 8) * LARGEST
     noise, floor = 2e-3, 0.02 * tips[0] * OWN
     fit = fitted(*rows_of_a_test(tips, np.zeros(8), noise, floor, seed))
     off, band = errors_of(fit, tips)
     assert np.max(np.abs(off)) < 3.3
-    # One size of relative noise for all has 0.22 to 0.56 %.
+    # With relative noise alone: 0.22 to 0.56 %.
     assert np.max(band[1:-1]) < 0.0015
 
 
-def test_errors_of_levels_that_know_nothing_of_one_another_are_theirs():
+def test_independent_level_errors_are_attributed_to_levels():
     tips = np.geomspace(0.15, 1.0, 6) * LARGEST
-    turned = np.radians([0.5, -0.8, 0.9, -0.3, 0.6, -0.7])
-    fit = fitted(*rows_of_a_test(tips, turned, 1e-3, 0.0, 3))
+    level_phase = np.radians([0.5, -0.8, 0.9, -0.3, 0.6, -0.7])
+    fit = fitted(*rows_of_a_test(tips, level_phase, 1e-3, 0.0, 3))
     off, _ = errors_of(fit, tips)
     assert np.max(np.abs(off)) < 3.3
-    assert fit.noise.level_std[1] == pytest.approx(np.std(turned, ddof=1), rel=0.5)
+    assert fit.noise.level_std[1] == pytest.approx(np.std(level_phase, ddof=1), rel=0.5)

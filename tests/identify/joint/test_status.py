@@ -1,4 +1,4 @@
-"""What a joint fit says of fits that did not converge, and how often its programs compile."""
+"""Status of joint fits that did not converge, and how often programs compile."""
 
 import logging
 
@@ -15,11 +15,11 @@ from snrmjax.io.joint_results import summarise_fit
 from snrmjax.numerics.facts import Fact
 
 
-def test_a_fit_that_still_moved_says_so(monkeypatch):
+def test_an_unconverged_fit_reports_it(monkeypatch):
     whole = posterior_view.fit_test
 
     def moving(*given, **named):
-        return whole(*given, **named)._replace(settled=False)
+        return whole(*given, **named)._replace(converged=False)
 
     monkeypatch.setattr(posterior_view, "fit_test", moving)
     fit = sj.fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
@@ -36,15 +36,15 @@ def test_a_fit_that_still_moved_says_so(monkeypatch):
     assert "not converged" in repr(fit)
 
 
-def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypatch):
+def test_resonances_and_folds_not_located_are_counted_and_noted(monkeypatch):
     fit = noisy_fit()
     before = sj.identify.fitted_response(fit, 2.2)[0]
     assert before.not_located == ()
     assert before.notes == ()
     whole = forced_motion.solved_point
 
-    def lost(one, force, place, *new):
-        return None if place.kind == "fold" else whole(one, force, place)
+    def lost(one, force, start, *new):
+        return None if start.kind == "fold" else whole(one, force, start)
 
     monkeypatch.setattr(forced_motion, "solved_point", lost)
     found = sj.identify.fitted_response(fit, 2.2)[0]
@@ -58,7 +58,7 @@ def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypa
     assert len(summarise_fit(fit, [found])["not_located"]) == 2
 
 
-def test_results_say_themselves_and_become_data_sets():
+def test_results_have_a_repr_a_plot_and_a_data_set():
     fit = noisy_fit()
     response, fractions = sj.identify.fitted_response(fit, 2.2)[0], sj.identify.contributions(fit)
     for result, name, unit in (
@@ -82,13 +82,13 @@ def compiled_programs(caplog, call):
     caplog.clear()
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         call()
-    said = [record.getMessage() for record in caplog.records]
-    return [text.split()[4] for text in said if text.startswith("Finished XLA compilation")]
+    messages = [record.getMessage() for record in caplog.records]
+    return [text.split()[4] for text in messages if text.startswith("Finished XLA compilation")]
 
 
 @pytest.mark.long
 def test_one_set_of_programs_serves_all_sizes_of_data_and_families(caplog):
-    """32 states in place of 31, or another family, compile no program of the package anew."""
+    """32 states instead of 31, or another family, recompile no program of the package."""
 
     def everything(n, damping):
         data = noisy(1, gain=0.01)

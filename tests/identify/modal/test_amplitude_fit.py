@@ -36,15 +36,15 @@ def states(shift, loss, *, levels=(0.3, 0.6, 1.0), noise=1e-3, seed=0, stated=Tr
 
 @pytest.mark.parametrize("loss", [0.0, 0.5])
 @pytest.mark.parametrize("stated", [True, False])
-def test_the_values_at_no_amplitude_are_found(loss, stated):
-    found, (note,) = find_modes(states(0.5, loss, stated=stated))
+def test_the_values_at_zero_amplitude_are_identified(loss, stated):
+    modes, (note,) = find_modes(states(0.5, loss, stated=stated))
     assert note.kind == "amplitude_dependent_mode"
     assert (note["power"], note["levels"]) == (2, (1, 2, 3))
     assert (note["damping_change"] is not None) == bool(loss)
-    assert found.n_modes == 1
+    assert modes.n_modes == 1
     exact = np.array([OWN, RATIO, *RESIDUE])
-    values = np.array([found.natural_frequency[0], found.damping_ratio[0], *found.residue[:, 0]])
-    std = np.sqrt(np.diag(found.mode_covariance[0]))
+    values = np.array([modes.natural_frequency[0], modes.damping_ratio[0], *modes.residue[:, 0]])
+    std = np.sqrt(np.diag(modes.mode_covariance[0]))
     assert np.all(np.abs(values - exact) < 3.5 * std)
     assert np.all(std < 0.01 * np.abs(exact))
     if loss:
@@ -53,18 +53,18 @@ def test_the_values_at_no_amplitude_are_found(loss, stated):
         assert note["damping_change"] == pytest.approx(loss * r**2 * RATIO, rel=0.03)
 
 
-def test_a_linear_mode_is_what_it_was():
+def test_a_linear_mode_is_unchanged():
     data = states(0.0, 0.0)
-    found, notes = find_modes(data)
+    modes, notes = find_modes(data)
     lowest = responses_of_states(data, 1)
     alone = fit_linear_modes(lowest.responses, std=lowest.std)
     assert [note.kind for note in notes] == ["levels_agree"]
-    np.testing.assert_array_equal(found.natural_frequency, alone.natural_frequency)
-    np.testing.assert_array_equal(found.mode_covariance, alone.mode_covariance)
+    np.testing.assert_array_equal(modes.natural_frequency, alone.natural_frequency)
+    np.testing.assert_array_equal(modes.mode_covariance, alone.mode_covariance)
 
 
 def test_derivatives_of_a_dependent_mode():
-    """Against central differences; two rows have a mode of their own."""
+    """Against central differences; two rows have a separate mode."""
     omega, load = OWN * np.array([0.99, 1.0, 1.002, 1.01]), np.array([0.5, 1.0, 1.0, 0.7])
     near = load / np.abs(OWN**2 - omega**2 + 2j * RATIO * OWN * omega)
     for power in (1, 2):
@@ -94,8 +94,8 @@ def test_few_states_about_a_lone_resonance_give_its_mode(shift):
     few = sj.measure.steady_states(*columns, np.asarray(data.velocity)[k], sensors=data.sensors)
     with pytest.raises(ValueError, match="no pole is stable"):
         fit_linear_modes(responses_of_states(few, 1).responses)
-    found, notes = find_modes(few)
+    modes, notes = find_modes(few)
     assert (notes[0].kind == "amplitude_dependent_mode") == bool(shift)
-    off = [(found.natural_frequency - OWN) / found.natural_frequency_std]
-    off.append((found.damping_ratio - RATIO) / found.damping_ratio_std)
+    off = [(modes.natural_frequency - OWN) / modes.natural_frequency_std]
+    off.append((modes.damping_ratio - RATIO) / modes.damping_ratio_std)
     assert np.all(np.abs(off) < 3)

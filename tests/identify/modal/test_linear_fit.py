@@ -50,13 +50,13 @@ def noisy(seed=0, noise=0.3, averages=20):
 
 
 def test_exact_responses_give_the_modes():
-    found = fit_linear_modes(responses(exact()))
-    assert np.allclose(found.natural_frequency, STRUCTURE.natural_frequency, rtol=1e-9)
-    assert np.allclose(found.damping_ratio, STRUCTURE.damping_ratio, rtol=1e-7)
+    modes = fit_linear_modes(responses(exact()))
+    assert np.allclose(modes.natural_frequency, STRUCTURE.natural_frequency, rtol=1e-9)
+    assert np.allclose(modes.damping_ratio, STRUCTURE.damping_ratio, rtol=1e-7)
     residue = STRUCTURE.shapes * STRUCTURE.shapes[0]
-    assert np.allclose(found.residue, residue, atol=1e-7)
-    assert np.all(found.collinearity > 1 - 1e-9)
-    assert np.allclose(found.curves.fitted, found.curves.measured, rtol=1e-6)
+    assert np.allclose(modes.residue, residue, atol=1e-7)
+    assert np.all(modes.collinearity > 1 - 1e-9)
+    assert np.allclose(modes.curves.fitted, modes.curves.measured, rtol=1e-6)
 
 
 def test_units_and_quantities_do_not_matter():
@@ -69,37 +69,37 @@ def test_units_and_quantities_do_not_matter():
         Channel("laser", "velocity", "mm/s", 1e-3),
         Channel("probe", "displacement"),
     ]
-    found = fit_linear_modes(responses(values, channels=channels))
-    assert np.allclose(found.residue, STRUCTURE.shapes * STRUCTURE.shapes[0], atol=1e-6)
+    modes = fit_linear_modes(responses(values, channels=channels))
+    assert np.allclose(modes.residue, STRUCTURE.shapes * STRUCTURE.shapes[0], atol=1e-6)
 
 
 def test_noise_by_coherence_stays_in_the_band():
     errors = []
     for seed in range(4):
-        found = fit_linear_modes(noisy(seed))
-        assert found.n_modes == 3
+        modes = fit_linear_modes(noisy(seed))
+        assert modes.n_modes == 3
         residue = STRUCTURE.shapes * STRUCTURE.shapes[0]
         errors += [
-            (found.natural_frequency - STRUCTURE.natural_frequency) / found.natural_frequency_std,
-            (found.damping_ratio - STRUCTURE.damping_ratio) / found.damping_ratio_std,
-            ((found.residue - residue) / found.residue_std).ravel(),
+            (modes.natural_frequency - STRUCTURE.natural_frequency) / modes.natural_frequency_std,
+            (modes.damping_ratio - STRUCTURE.damping_ratio) / modes.damping_ratio_std,
+            ((modes.residue - residue) / modes.residue_std).ravel(),
         ]
         # The residuals are those of the stated coherence.
-        assert np.all(np.abs(found.misfit - 1) < 0.1)
+        assert np.all(np.abs(modes.misfit - 1) < 0.1)
     size = np.sqrt(np.mean(np.concatenate(errors) ** 2))
     # 60 normalised errors, correlated within a fit: their rms is 1 within some 25 %.
     assert 0.75 < size < 1.3
 
 
-def test_errors_that_nobody_states_are_found_from_the_residuals():
+def test_unstated_errors_are_estimated_from_the_residuals():
     data = noisy()
-    found = fit_linear_modes(
+    modes = fit_linear_modes(
         dataclasses.replace(data, coherence=np.full_like(data.coherence, np.nan))
     )
     stated = fit_linear_modes(data)
-    assert found.source == "residuals"
-    assert np.all(np.isnan(found.misfit))
-    ratio = found.natural_frequency_std / stated.natural_frequency_std
+    assert modes.source == "residuals"
+    assert np.all(np.isnan(modes.misfit))
+    ratio = modes.natural_frequency_std / stated.natural_frequency_std
     assert np.all((ratio > 0.8) & (ratio < 1.25))
 
 
@@ -110,10 +110,10 @@ def test_two_modes_within_one_half_power_band():
     clean = exact(omega, close)
     rng = np.random.default_rng(0)
     noise = 0.02 * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape))
-    found = fit_linear_modes(responses(clean + noise, omega, ACCELEROMETERS[:2]))
-    assert found.n_modes == 2
-    assert np.allclose(found.natural_frequency, close.natural_frequency, rtol=1e-4)
-    assert np.allclose(found.damping_ratio, close.damping_ratio, rtol=0.02)
+    modes = fit_linear_modes(responses(clean + noise, omega, ACCELEROMETERS[:2]))
+    assert modes.n_modes == 2
+    assert np.allclose(modes.natural_frequency, close.natural_frequency, rtol=1e-4)
+    assert np.allclose(modes.damping_ratio, close.damping_ratio, rtol=0.02)
 
 
 def test_modes_by_hand_and_by_order():
@@ -121,43 +121,43 @@ def test_modes_by_hand_and_by_order():
     two = STRUCTURE.natural_frequency[:2]
     by_hand = fit_linear_modes(data, poles=list(two * 1.005), to_frequency=75 * HERTZ)
     assert np.allclose(by_hand.natural_frequency, two, rtol=2e-4)
-    # Most poles of a high order are of noise: they are left out by their residues.
+    # Most poles of a high order are spurious: they are rejected by their residues.
     by_order = fit_linear_modes(data, order=30)
     assert np.allclose(by_order.natural_frequency, STRUCTURE.natural_frequency, rtol=1e-4)
 
 
 def test_modes_outside_the_band_are_residual_terms():
     # The band holds the second mode alone: one below, one above.
-    found = fit_linear_modes(responses(exact()), from_frequency=45 * HERTZ, to_frequency=75 * HERTZ)
-    assert found.n_modes == 1
-    assert found.natural_frequency[0] == pytest.approx(STRUCTURE.natural_frequency[1], rel=1e-5)
+    modes = fit_linear_modes(responses(exact()), from_frequency=45 * HERTZ, to_frequency=75 * HERTZ)
+    assert modes.n_modes == 1
+    assert modes.natural_frequency[0] == pytest.approx(STRUCTURE.natural_frequency[1], rel=1e-5)
     residue = STRUCTURE.shapes[:, 1] * STRUCTURE.shapes[0, 1]
-    assert np.allclose(found.residue[:, 0], residue, rtol=5e-3)
+    assert np.allclose(modes.residue[:, 0], residue, rtol=5e-3)
 
 
-def test_the_phase_of_an_instrument_is_found():
-    turned = exact() * np.exp(0.1j)
-    found = fit_linear_modes(responses(turned), instrument_phase=True)
-    assert found.phase == pytest.approx(0.1, abs=1e-6)
-    assert np.allclose(found.damping_ratio, STRUCTURE.damping_ratio, rtol=1e-5)
-    # Not freed, it is seen in the residues.
-    held = fit_linear_modes(responses(turned))
+def test_the_phase_of_an_instrument_is_fitted():
+    rotated = exact() * np.exp(0.1j)
+    modes = fit_linear_modes(responses(rotated), instrument_phase=True)
+    assert modes.phase == pytest.approx(0.1, abs=1e-6)
+    assert np.allclose(modes.damping_ratio, STRUCTURE.damping_ratio, rtol=1e-5)
+    # Not fitted, it appears in the residues.
+    fixed = fit_linear_modes(responses(rotated))
     # In part: the fitted poles follow some of it.
-    assert np.all((held.mean_phase > 0.03) & (held.mean_phase < 0.12))
-    (note, *_) = [note for note in held.notes if note.kind == "residues_turned"]
+    assert np.all((fixed.mean_phase > 0.03) & (fixed.mean_phase < 0.12))
+    (note, *_) = [note for note in fixed.notes if note.kind == "residues_turned"]
     assert "(free it)" in str(note)
 
 
-def test_a_phase_that_is_free_is_not_to_be_freed():
-    """One mode alone is turned, as a neighbour that was missed does."""
+def test_a_fitted_phase_is_not_advised():
+    """One mode alone is rotated, as by a missed neighbour."""
     omega, damping = STRUCTURE.natural_frequency[1], STRUCTURE.damping_ratio[1]
     part = (STRUCTURE.shapes[:, 1] * STRUCTURE.shapes[0, 1])[:, None] * -(LINES**2)
     part = part / (omega**2 - LINES**2 + 2j * damping * omega * LINES)
-    turned = exact() + (np.exp(0.3j) - 1) * part
-    found = fit_linear_modes(responses(turned), instrument_phase=True)
-    (note, *_) = [note for note in found.notes if note.kind == "residues_turned"]
+    rotated = exact() + (np.exp(0.3j) - 1) * part
+    modes = fit_linear_modes(responses(rotated), instrument_phase=True)
+    (note, *_) = [note for note in modes.notes if note.kind == "residues_turned"]
     assert "free it" not in str(note)
-    assert "a neighbouring mode that was missed" in str(note)
+    assert "a missed neighbouring mode" in str(note)
 
 
 def test_derivatives_of_the_bases():
@@ -190,13 +190,13 @@ def test_leakage_of_a_window_is_modelled_or_stated():
     modelled, plain = fit_linear_modes(data, window="hann"), fit_linear_modes(data)
     error = np.abs(modelled.damping_ratio - light.damping_ratio)
     assert np.all(error < 4 * modelled.damping_ratio_std)
-    # One to three lines in the half-power bands: leakage adds damping, and the notes say how much.
-    away = plain.damping_ratio / light.damping_ratio - 1
-    said = [note["bias"] for note in plain.notes if note.kind == "leakage"]
-    assert max(said) > 0.03
+    # One to three lines in the half-power bands: leakage adds damping, as the notes state.
+    deviation = plain.damping_ratio / light.damping_ratio - 1
+    bias = [note["bias"] for note in plain.notes if note.kind == "leakage"]
+    assert max(bias) > 0.03
     random = plain.damping_ratio_std / light.damping_ratio
-    assert np.all(np.abs(away - said) < 4 * random)
-    assert np.max(away / random) > 4
+    assert np.all(np.abs(deviation - bias) < 4 * random)
+    assert np.max(deviation / random) > 4
     # Residues of an accelerance under the window, whose impulse response begins with an impulse.
     residue = STRUCTURE.shapes * STRUCTURE.shapes[0]
     assert np.all(np.abs(modelled.residue - residue) < 5 * modelled.residue_std + 1e-3)
@@ -211,32 +211,32 @@ def decay(seed=0, noise=0.02):
 
 
 def test_a_free_decay_gives_frequency_damping_and_shape():
-    # Clusters of noise among the thirty orders are left out by their amplitudes.
-    found = fit_free_decay(decay(), highest_order=30)
-    assert found.n_modes == 3
+    # Spurious clusters among the thirty orders are rejected by their amplitudes.
+    modes = fit_free_decay(decay(), highest_order=30)
+    assert modes.n_modes == 3
     for value, std, truth in (
-        (found.natural_frequency, found.natural_frequency_std, STRUCTURE.natural_frequency),
-        (found.damping_ratio, found.damping_ratio_std, STRUCTURE.damping_ratio),
+        (modes.natural_frequency, modes.natural_frequency_std, STRUCTURE.natural_frequency),
+        (modes.damping_ratio, modes.damping_ratio_std, STRUCTURE.damping_ratio),
     ):
         assert np.all(np.abs(value - truth) < 4 * std)
         assert np.all(std / truth < [0.05, 0.05, 0.05])
     top = np.argmax(np.abs(STRUCTURE.shapes), axis=0)
     relative = STRUCTURE.shapes / STRUCTURE.shapes[top, range(3)]
-    assert np.all(np.abs(found.shape - relative) <= 4 * found.shape_std + 1e-12)
+    assert np.all(np.abs(modes.shape - relative) <= 4 * modes.shape_std + 1e-12)
     # Several decays halve the variance.
     both = fit_free_decay([decay(1), decay(2)], highest_order=12)
-    ratio = both.natural_frequency_std / found.natural_frequency_std
+    ratio = both.natural_frequency_std / modes.natural_frequency_std
     assert np.allclose(ratio, np.sqrt(0.5), rtol=0.15)
 
 
 def test_results_are_labelled_and_drawn():
-    found = fit_linear_modes(responses(exact()), poles=[400.0], to_frequency=75 * HERTZ)
-    data = found.to_xarray()
+    modes = fit_linear_modes(responses(exact()), poles=[400.0], to_frequency=75 * HERTZ)
+    data = modes.to_xarray()
     assert data.natural_frequency_hz.attrs["units"] == "Hz"
     assert data.residue.dims == ("sensor", "mode")
-    measured = found.plot(sensors=["a2"]).axes[0].lines[0]
-    assert np.allclose(measured.get_xdata(), found.curves.omega / HERTZ)
-    assert np.allclose(measured.get_ydata(), np.abs(found.curves.measured[1]))
+    measured = modes.plot(sensors=["a2"]).axes[0].lines[0]
+    assert np.allclose(measured.get_xdata(), modes.curves.omega / HERTZ)
+    assert np.allclose(measured.get_ydata(), np.abs(modes.curves.measured[1]))
 
 
 BAD = [
@@ -303,7 +303,7 @@ BAD = [
         lambda: fit_free_decay(time_recording(np.ones((1, 99)), [FORCE], 9.0)),
     ),
     (
-        "is zero all along",
+        "is zero throughout",
         lambda: fit_free_decay(time_recording(np.zeros((1, 99)), [ACCELEROMETERS[0]], 9.0)),
     ),
     (
@@ -313,9 +313,9 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("said", "wrong"), BAD, ids=[f"{k} {b[0]}" for k, b in enumerate(BAD)])
-def test_wrong_input_is_named(said, wrong):
-    with pytest.raises(ValueError, match=said) as error:
+@pytest.mark.parametrize(("message", "wrong"), BAD, ids=[f"{k} {b[0]}" for k, b in enumerate(BAD)])
+def test_wrong_input_is_named(message, wrong):
+    with pytest.raises(ValueError, match=message) as error:
         wrong()
     assert str(error.value).rstrip().endswith(".")
 

@@ -36,26 +36,26 @@ def decay(seconds, *, noise=1e-3, **forces):
     [
         ({"cubic": 0.3}, None),
         ({"cubic": -0.2}, 100.0),
-        ({"cubic": 0.01}, None),  # as two linear modes beside each other have it, within noise
+        ({"cubic": 0.01}, None),  # indistinguishable from two close linear modes within noise
         ({"drag": 0.04}, None),
     ],
 )
 def test_the_limit_of_small_motion_lies_in_its_band(force, to_hz):
     done = []
-    found = fit_free_decay(
+    modes = fit_free_decay(
         decay(1.5, **force),
         to_frequency=to_hz and to_hz * HERTZ,
         progress=lambda *part: done.append(part),
     )
-    assert found.n_modes == 1
-    assert [note.kind for note in found.notes] == ["decay_moves_with_amplitude"]
-    off = (found.natural_frequency[0] - HERTZ * HZ) / found.natural_frequency_std[0]
-    apart = (found.damping_ratio[0] - RATIO) / found.damping_ratio_std[0]
+    assert modes.n_modes == 1
+    assert [note.kind for note in modes.notes] == ["decay_moves_with_amplitude"]
+    off = (modes.natural_frequency[0] - HERTZ * HZ) / modes.natural_frequency_std[0]
+    apart = (modes.damping_ratio[0] - RATIO) / modes.damping_ratio_std[0]
     assert abs(off) < 3.5
     assert abs(apart) < 3.5
     # Bands that a motion of a thousand times the noise allows.
-    assert found.natural_frequency_std[0] < 2e-4 * HERTZ * HZ
-    assert found.damping_ratio_std[0] < 0.02 * RATIO
+    assert modes.natural_frequency_std[0] < 2e-4 * HERTZ * HZ
+    assert modes.damping_ratio_std[0] < 0.02 * RATIO
     assert done[-1][0] <= done[-1][1]
 
 
@@ -63,21 +63,21 @@ def test_the_limit_of_small_motion_lies_in_its_band(force, to_hz):
     ("seconds", "force", "why"),
     [(0.25, {"cubic": 0.6}, "still changing"), (1.0, {"friction": 0.02}, "dry friction")],
 )
-def test_a_decay_that_never_is_linear_is_refused(seconds, force, why):
+def test_a_decay_without_a_linear_part_is_refused(seconds, force, why):
     with pytest.raises(ValueError, match=f"not that of linear modes: .*{why}.* linear"):
         fit_free_decay(decay(seconds, **force))
 
 
-def test_waves_of_a_moving_mode_and_their_slopes():
+def test_waves_of_an_amplitude_dependent_mode_and_their_slopes():
     """Against its slow flow integrated in time; slopes against central differences."""
     time = np.arange(800) / 400.0
     form = WaveForm(2, 0, (1, 2), ((0, 2), (3, 3), (1, 3)))
     at = np.array([300.0, 500.0, 0.005, 0.01, 0.3, 0.2, 5.0, 20.0])
 
     def flow(_, state):
-        size = np.exp(state[0])
-        decay_rate = 1.5 + 0.3 * size + 0.2 * size**2
-        return -decay_rate, 300 * np.sqrt(1 - 0.005**2) + 5 * size + 20 * size**2
+        amplitude = np.exp(state[0])
+        decay_rate = 1.5 + 0.3 * amplitude + 0.2 * amplitude**2
+        return -decay_rate, 300 * np.sqrt(1 - 0.005**2) + 5 * amplitude + 20 * amplitude**2
 
     exact = solve_ivp(flow, (0, 2), (0, 0), t_eval=time, rtol=1e-10, atol=1e-10).y
     made = decaying_columns(time, at, form)

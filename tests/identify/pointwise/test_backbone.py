@@ -28,26 +28,26 @@ def squared(amplitude):
 
 
 def duffing_test(seed, *, amplitude=0.0, phase=0.0, force=0.0, levels=(0.0,) * 4, stated=True):
-    """States of a test with held forces: amplitudes fall with the distance from resonance.
+    """States of a force-controlled test: amplitudes fall with the distance from resonance.
 
-    Errors are relative and 1σ; `levels` are scales of the half-normal 1σ of what levels differ by:
-    gain, phase, stiffness and damping.
+    Errors are relative and 1σ; `levels` are scales of the half-normal 1σ of differences between
+    levels: gain, phase, stiffness and damping.
     """
     rng = np.random.default_rng(seed)
     angle = np.radians(rng.uniform(-55, 55, LEVELS * STATES))
-    held = np.linspace(0.16, 1.0, LEVELS)[LEVEL] * (0.7 + 0.3 * np.cos(angle))
+    amplitudes = np.linspace(0.16, 1.0, LEVELS)[LEVEL] * (0.7 + 0.3 * np.cos(angle))
     draw = rng.standard_normal((4, LEVELS * STATES))
-    sizes = levels * np.abs(rng.standard_normal(4))
-    gain, turned, stiffer, lossier = (sizes[:, None] * rng.standard_normal((4, LEVELS)))[:, LEVEL]
-    own, rate = squared(held) * (1 + stiffer), RATE * (1 + lossier)
+    scales = levels * np.abs(rng.standard_normal(4))
+    gain, lead, stiffer, lossier = (scales[:, None] * rng.standard_normal((4, LEVELS)))[:, LEVEL]
+    own, rate = squared(amplitudes) * (1 + stiffer), RATE * (1 + lossier)
     # tan φ = (ω̃² − Ω²)/(δΩ), a quadratic for Ω; |ω̃² − Ω² + iδΩ| Q = |A|F.
-    turn = rate * np.tan(angle)
-    frequency = -turn / 2 + np.sqrt(turn**2 / 4 + own)
+    slope = rate * np.tan(angle)
+    frequency = -slope / 2 + np.sqrt(slope**2 / 4 + own)
     stiffness = own - frequency**2 + 1j * rate * frequency
-    applied = held * np.abs(stiffness) / CONSTANT
+    applied = amplitudes * np.abs(stiffness) / CONSTANT
     velocity = 1j * frequency * CONSTANT * applied / stiffness
     measured = velocity * (1 + amplitude * draw[0]) * np.exp(1j * phase * draw[1])
-    measured = measured * np.exp(gain + 1j * turned)
+    measured = measured * np.exp(gain + 1j * lead)
     recorded = applied * (1 + force * draw[2])
     return steady_states(
         LEVEL,
@@ -67,13 +67,13 @@ def fitted(data, modes=MODES, **settings):
 class TestExactPoints:
     @pytest.mark.parametrize("seed", [0, 1])
     def test_a_duffing_backbone_is_recovered(self, seed):
-        found = fitted(duffing_test(seed, stated=False))
-        values = found.backbone.values(GRID)
+        identification = fitted(duffing_test(seed, stated=False))
+        values = identification.backbone.values(GRID)
         # Noise is taken to be 1e-5 at least, and to grow off resonance.
         np.testing.assert_allclose(values.natural_frequency, np.sqrt(squared(GRID)), rtol=1e-6)
         np.testing.assert_allclose(values.modal_damping, RATE, rtol=1e-4)
-        assert not found.fit.noise.stated
-        assert found.fit.noise.scale < 1e-5
+        assert not identification.fit.noise.stated
+        assert identification.fit.noise.scale < 1e-5
 
     def test_the_backbone_itself(self):
         backbone = fitted(duffing_test(0, stated=False)).backbone
@@ -121,20 +121,20 @@ class TestExactPoints:
 
 
 def study(seeds, modes=MODES, **errors):
-    """Standardised errors of both curves on the grid, and what the fits say of the noise."""
-    scores, sizes = [], []
+    """Standardised errors of both curves on the grid, and the noise scale of the fits."""
+    scores, scales = [], []
     for seed in range(seeds):
-        found = fitted(duffing_test(seed, **errors), modes)
-        values = found.backbone.values(GRID)
+        identification = fitted(duffing_test(seed, **errors), modes)
+        values = identification.backbone.values(GRID)
         off = np.asarray(values.natural_frequency) - np.sqrt(squared(GRID))
         lost = np.asarray(values.modal_damping) - RATE
         scores.append([off / values.natural_frequency_std, lost / values.modal_damping_std])
-        sizes.append(found.fit.noise.scale)
-    return np.array(scores), np.array(sizes)
+        scales.append(identification.fit.noise.scale)
+    return np.array(scores), np.array(scales)
 
 
 STATED = {"amplitude": 0.01, "phase": 0.01, "force": 0.005}
-# What levels of published tests differ by, which bands count on unless a structure states it.
+# Differences between levels of published tests: the prior of bands unless a structure states one.
 PUBLISHED = (0.05, 0.02, 0.008, 0.05)
 ALIKE = sj.model.structure(
     MODES,
@@ -144,31 +144,31 @@ ALIKE = sj.model.structure(
 
 
 class TestBands:
-    # 95 % are meant, and 100 seeds know it to 2 %. A size that is found from six levels is taken
-    # for one more uncertain, as Student has it: nearer to all of them where no level lies far out.
+    # Nominal coverage 95 %, known to 2 % from 100 seeds. A scale estimated from six levels is
+    # uncertain (Student): coverage is higher where no level is an outlier.
     @pytest.mark.long
     @pytest.mark.parametrize(("modes", "levels"), [(MODES, PUBLISHED), (ALIKE, (0.0,) * 4)])
     def test_bands_of_stated_noise_cover_the_truth(self, modes, levels):
-        scores, sizes = study(100, modes, levels=levels, **STATED)
+        scores, scales = study(100, modes, levels=levels, **STATED)
         covered = np.mean(np.abs(scores) < 1.96, axis=0)
-        # Straight lines are what is expected of curves, and right here.
+        # The prior favours straight lines, which are right here.
         assert covered.min() >= 0.88
         assert 0.93 <= covered.mean() <= 0.995
-        np.testing.assert_allclose(np.sqrt(np.mean(sizes**2)), 1.0, atol=0.1)
+        np.testing.assert_allclose(np.sqrt(np.mean(scales**2)), 1.0, atol=0.1)
 
     @pytest.mark.long
-    def test_levels_that_nobody_said_to_be_alike_may_differ(self):
-        # Six levels that scatter by chance alone do not show that all of them err by nothing:
-        # bands count on what they may have in common, and hold more than 95 % where it is nothing.
-        errors, told = (study(20, modes, **STATED)[0] for modes in (MODES, ALIKE))
-        assert np.mean(np.abs(errors) < 1.96) >= np.mean(np.abs(told) < 1.96)
-        assert np.sqrt(np.mean(errors**2)) < 0.7 * np.sqrt(np.mean(told**2))
+    def test_levels_not_stated_to_be_alike_may_differ(self):
+        # Six levels with random scatter alone do not exclude a common error: bands include it and
+        # cover more than 95 % without one.
+        errors, errors_alike = (study(20, modes, **STATED)[0] for modes in (MODES, ALIKE))
+        assert np.mean(np.abs(errors) < 1.96) >= np.mean(np.abs(errors_alike) < 1.96)
+        assert np.sqrt(np.mean(errors**2)) < 0.7 * np.sqrt(np.mean(errors_alike**2))
 
     @pytest.mark.long
-    def test_noise_that_was_not_stated_is_found(self):
-        scores, sizes = study(100, amplitude=0.01, phase=0.01, levels=PUBLISHED, stated=False)
-        # Relative noise 1 %; points off resonance are mistrusted up to 3 times as much.
-        assert 0.003 < np.sqrt(np.mean(sizes**2)) < 0.012
+    def test_unstated_noise_is_estimated(self):
+        scores, scales = study(100, amplitude=0.01, phase=0.01, levels=PUBLISHED, stated=False)
+        # Relative noise 1 %; points off resonance have up to 3 times the error.
+        assert 0.003 < np.sqrt(np.mean(scales**2)) < 0.012
         assert 0.85 <= np.mean(np.abs(scores) < 1.96) <= 0.995
 
 
@@ -196,8 +196,8 @@ class TestStd:
         drawn = [
             backbone(values + root @ rng.normal(size=6), np.eye(6)).values(at) for _ in range(2000)
         ]
-        found = backbone(values, root @ root.T)
-        values = found.values(at)
+        identification = backbone(values, root @ root.T)
+        values = identification.values(at)
         # 2000 draws know a standard deviation to 1.6 %. Both curves err together here.
         for name in ("natural_frequency", "damping_ratio"):
             spread = np.std([np.asarray(getattr(one, name)) for one in drawn], axis=0)
@@ -207,8 +207,8 @@ class TestStd:
         line = Spline.through(
             np.array([0.0, 1.0]), np.array([1.0, -1.0]), jnp.asarray(1.0), "displacement"
         )
-        found = fitted(duffing_test(0, stated=False))
-        broken = eqx.tree_at(lambda b: b.squared_frequency, found.backbone, line)
+        identification = fitted(duffing_test(0, stated=False))
+        broken = eqx.tree_at(lambda b: b.squared_frequency, identification.backbone, line)
         at = jnp.array([0.5, 0.9])
         assert np.isfinite(broken.natural_frequency(at)[0])
         assert np.isnan(broken.natural_frequency(at)[1])
@@ -232,7 +232,7 @@ class TestRefusals:
         np.testing.assert_allclose(values.natural_frequency, np.sqrt(squared(ends)), rtol=0.01)
 
 
-def test_bands_hold_damping_that_changes_with_the_frequency_of_the_force():
+def test_bands_cover_damping_that_changes_with_the_forcing_frequency():
     # Viscous damping of 0.25 % and a hysteretic one of 0.25 %, c(Ω) = c₁ + c₂ ω/Ω, measured below
     # resonance only: the curve of a one-sided test is off by up to c₂ ln(Ω/ω), which is known.
     natural, modal = 2 * np.pi * 50.0, 0.01 * 2 * np.pi * 50.0
@@ -246,6 +246,8 @@ def test_bands_hold_damping_that_changes_with_the_frequency_of_the_force():
     )  # fmt: skip
     backbone = fitted(data, linear_modes([natural], [0.0025], [[1.0]], [1.0])).backbone
     ends = float(backbone.smallest), float(backbone.largest)
-    found = backbone.values(jnp.linspace(*ends, 21))
-    off = np.abs(np.asarray(found.modal_damping) - modal) / np.asarray(found.modal_damping_std)
+    identification = backbone.values(jnp.linspace(*ends, 21))
+    off = np.abs(np.asarray(identification.modal_damping) - modal) / np.asarray(
+        identification.modal_damping_std
+    )
     assert np.mean(off < 1.96) > 0.9

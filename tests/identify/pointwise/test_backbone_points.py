@@ -133,7 +133,7 @@ class TestExactStates:
         points = identify_points(data, three_modes())
         np.testing.assert_allclose(points.natural_frequency, TRUTH.natural, rtol=ROUNDING)
         np.testing.assert_allclose(points.velocity, TRUTH.velocity[:, 0], rtol=ROUNDING)
-        # A state that nobody measured is not solved, and leaves the others alone.
+        # A state without a measurement is not solved and does not affect the others.
         measured[3] = False
         lost = identify_points(
             eqx.tree_at(lambda d: d.measured, data, jnp.asarray(measured)), three_modes()
@@ -204,16 +204,16 @@ class TestPeak:
     def test_peak_of_a_hand_made_signal(self):
         # v₁ cos τ + 0.2 v₁ cos 3τ peaks at τ = 0, at 1.2 v₁, whatever the phase of v₁.
         own = TRUTH.velocity[:, 0]
-        turn = own / np.abs(own)
-        third = 0.2 * np.abs(own) * turn**3
+        phase_factor = own / np.abs(own)
+        third = 0.2 * np.abs(own) * phase_factor**3
         modes = three_modes((0,))
         data = TRUTH.table((0,), harmonics=third[:, None, None], harmonic_order=(3,))
-        found = identify_points(data, modes, measure="peak")
+        actual = identify_points(data, modes, measure="peak")
         larger = eqx.tree_at(lambda d: d.velocity, TRUTH.table((0,)), 1.2 * own[:, None])
         expected = identify_points(larger, modes)
-        # The peak is found to rounding; its phase stays that of the fundamental.
-        np.testing.assert_allclose(found.natural_frequency, expected.natural_frequency, 1e-11)
-        np.testing.assert_allclose(found.damping_ratio, expected.damping_ratio, rtol=1e-10)
+        # The peak is exact to rounding; its phase stays that of the fundamental.
+        np.testing.assert_allclose(actual.natural_frequency, expected.natural_frequency, 1e-11)
+        np.testing.assert_allclose(actual.damping_ratio, expected.damping_ratio, rtol=1e-10)
         fundamental = identify_points(data, modes)
         np.testing.assert_allclose(fundamental.damping_ratio, TRUTH.damping, rtol=1e-11)
         # Eq. (20): the mean over both harmonics of cos² of their phases.
@@ -225,8 +225,8 @@ class TestPeak:
         own = TRUTH.velocity[:, 0]
         harmonics = np.full((len(own), 1, 1), np.nan + 0j)
         data = TRUTH.table((0,), harmonics=harmonics, harmonic_order=(3,))
-        found = identify_points(data, three_modes((0,)), measure="peak")
-        np.testing.assert_allclose(found.damping_ratio, TRUTH.damping, rtol=1e-11)
+        actual = identify_points(data, three_modes((0,)), measure="peak")
+        np.testing.assert_allclose(actual.damping_ratio, TRUTH.damping, rtol=1e-11)
 
 
 def one_state():
@@ -241,7 +241,7 @@ def one_state():
 
 
 def spread(points):
-    """What the points scatter over what they state, for ω̃ and ζ̃; 4000 draws know it to 1.1 %."""
+    """Scatter of the points over their stated 1σ, for ω̃ and ζ̃; known to 1.1 % from 4000 draws."""
     ratios = []
     for name in ("natural_frequency", "damping_ratio"):
         stated = np.asarray(getattr(points, name + "_std"))
@@ -308,8 +308,8 @@ class TestStatedErrors:
         np.testing.assert_allclose(spread(points), 1.0, atol=0.1)
         # The best linear estimate of η from V_s = Φ_s η + noise has 1/var = Σ Φ_s²/std_s².
         best = SHAPE[0, 1] / np.sqrt(np.sum((SHAPE[:, 1] / std) ** 2))
-        found = np.std(np.asarray(points.mode_velocity).real, ddof=1)
-        np.testing.assert_allclose(found, best, rtol=0.05)  # four times the 1.1 % of 4000 draws
+        actual = np.std(np.asarray(points.mode_velocity).real, ddof=1)
+        np.testing.assert_allclose(actual, best, rtol=0.05)  # four times the 1.1 % of 4000 draws
         assert best < 0.8 * std[0]
 
     @pytest.mark.parametrize("sensors", [(0,), (0, 1, 2)])

@@ -150,15 +150,15 @@ def test_points_without_a_joint_fit_predict_the_response_too():
 @pytest.mark.parametrize("name", ["phases", "both"])
 def test_the_force_of_a_measured_motion_is_the_measured_one(name):
     case = CASES[name]
-    found = inverse_force(structure_of(case), states_of(case), harmonic_order=1)
-    np.testing.assert_allclose(found.force, np.repeat([0.5, 1.0, 2.0], 15), rtol=1e-7)
+    result = inverse_force(structure_of(case), states_of(case), harmonic_order=1)
+    np.testing.assert_allclose(result.force, np.repeat([0.5, 1.0, 2.0], 15), rtol=1e-7)
 
 
 def test_a_describing_function_at_the_sensor_is_zero():
     """Of a linear structure, so that its modes are the eigenvalue's."""
     case, pole = CASES["both"], pole_of(CASES["both"].damping)
-    found = sj.methods.arslan_ozguven(states_of(case), structure_of(case).modes)
-    table = found.to_pandas()
+    result = sj.methods.arslan_ozguven(states_of(case), structure_of(case).modes)
+    table = result.to_pandas()
     np.testing.assert_allclose(table["frequency_hz"], abs(pole) / (2 * np.pi), rtol=1e-9)
     np.testing.assert_allclose(table["damping_ratio"], -pole.real / abs(pole), rtol=1e-7)
 

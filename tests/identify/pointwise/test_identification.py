@@ -1,4 +1,4 @@
-"""The whole inverse method: a measured bolted beam, a linear mode, and what the notes say."""
+"""The whole inverse method: a measured bolted beam, a linear mode, and the notes."""
 
 from pathlib import Path
 
@@ -48,13 +48,13 @@ def model():
 
 
 @pytest.fixture(scope="module")
-def found(data, model):
+def identification(data, model):
     return sj.identify_backbone(data, model.modes)
 
 
 @pytest.fixture(scope="module")
 def crossings(data, model):
-    """Of every level, read off its phase alone: resonance, velocity and damping there.
+    """Resonance of every level from its phase alone: frequency, velocity and damping there.
 
     Where the velocity is in phase with the force, Ω = ω̃ and 2ζ̃ω̃ = |A|F/v.
     """
@@ -75,19 +75,19 @@ def crossings(data, model):
 
 class TestMeasuredBeam:
     def test_bands_and_what_levels_differ_by_cover_where_every_level_is_in_phase(
-        self, found, crossings
+        self, identification, crossings
     ):
-        backbone = found.backbone
+        backbone = identification.backbone
         frequency, speed, damping = crossings
         values = backbone.values(np.clip(speed / frequency, backbone.smallest, backbone.largest))
         # What levels may differ by, if curves do not bend for it: runs repeat to 0.1 to 0.15 Hz, as
         # those who measured them say.
-        apart = 0.5 * float(found.fit.prior.new_level[2]) * frequency
+        apart = 0.5 * float(identification.fit.prior.new_level[2]) * frequency
         assert apart.max() / HERTZ < 0.15
         std = np.hypot(values.natural_frequency_std, apart)
         assert np.abs((values.natural_frequency - frequency) / std).max() < 1.96
         # Damping of the levels repeats to about 10 %, as those who measured it say.
-        of_level = float(found.fit.prior.new_level[3])
+        of_level = float(identification.fit.prior.new_level[3])
         assert of_level < 0.1
         std = np.hypot(values.damping_ratio_std, of_level * damping)
         assert np.abs((values.damping_ratio - damping) / std).max() < 1.96
@@ -108,8 +108,8 @@ class TestMeasuredBeam:
         stiffness = fit.noise.level_std[2]
         assert 0.5 * stiffness * 80.4 < 0.1  # Hz
 
-    def test_the_backbone_softens_and_stiffens(self, found):
-        backbone = found.backbone
+    def test_the_backbone_softens_and_stiffens(self, identification):
+        backbone = identification.backbone
         amplitude = np.linspace(float(backbone.smallest), float(backbone.largest), 400)
         values = backbone.values(amplitude)
         hertz = np.asarray(values.natural_frequency) / HERTZ
@@ -124,15 +124,17 @@ class TestMeasuredBeam:
         assert 20 < acceleration < 50
         assert values.damping_ratio[0] == pytest.approx(0.0015, rel=0.1)
 
-    def test_scatter_is_told(self, found):
+    def test_scatter_is_reported(self, identification):
         # From 0.54 to 0.97 % inside the highest level, least where the velocity lags most.
-        assert any(n.kind == "damping_changes_with_phase" and n["change"] > 0 for n in found.notes)
+        assert any(
+            n.kind == "damping_changes_with_phase" and n["change"] > 0 for n in identification.notes
+        )
 
 
 class TestLinearMode:
     def test_exact_states_give_the_linear_mode(self):
-        found = sj.identify_backbone(linear_test(0, 0.0), MODES)
-        backbone = found.backbone
+        identification = sj.identify_backbone(linear_test(0, 0.0), MODES)
+        backbone = identification.backbone
         at = np.linspace(float(backbone.smallest), float(backbone.largest), 7)
         # Noise is taken to be 1e-5 at least, and a level's errors as much.
         np.testing.assert_allclose(backbone.natural_frequency(at), W0, rtol=1e-7)
@@ -151,12 +153,12 @@ class TestLinearMode:
 
     def test_stated_errors_are_left_as_stated(self):
         data = linear_test(0, 0.01, stated=True)
-        found = sj.identify_backbone(data, MODES)
+        identification = sj.identify_backbone(data, MODES)
         points = sj.identify.identify_points(data, MODES)
         np.testing.assert_array_equal(
-            found.points.natural_frequency_std, points.natural_frequency_std
+            identification.points.natural_frequency_std, points.natural_frequency_std
         )
-        assert found.fit.noise.stated
+        assert identification.fit.noise.stated
 
     def test_noise_larger_than_stated_is_noted(self):
         data = linear_test(0, 0.03)
@@ -172,21 +174,21 @@ class TestLinearMode:
         notes = sj.identify_backbone(stated, MODES).notes
         assert "noise_exceeded" in {note.kind for note in notes}
 
-    @pytest.mark.parametrize(("turn", "sign"), [(0.0, []), (0.2, [-1]), (-0.2, [1])])
-    def test_a_phase_that_is_off_shows_in_the_damping(self, turn, sign):
+    @pytest.mark.parametrize(("phase", "sign"), [(0.0, []), (0.2, [-1]), (-0.2, [1])])
+    def test_a_phase_that_is_off_shows_in_the_damping(self, phase, sign):
         data = linear_test(0, 0.003)
-        velocity = data.velocity[:, 0] * np.exp(1j * turn)
-        turned = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
-        notes = sj.identify_backbone(turned, MODES).notes
-        found = [n["change"] for n in notes if n.kind == "damping_changes_with_phase"]
+        velocity = data.velocity[:, 0] * np.exp(1j * phase)
+        shifted = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
+        notes = sj.identify_backbone(shifted, MODES).notes
+        changes = [n["change"] for n in notes if n.kind == "damping_changes_with_phase"]
         # 2ζ̃ω̃ is |A|F cos φ/v: a phase that reads too high makes it fall towards the lead side.
-        assert np.sign(found).tolist() == sign
+        assert np.sign(changes).tolist() == sign
 
     def test_points_without_a_solution_are_counted(self):
         data = linear_test(0, 0.0)
         velocity = np.asarray(data.velocity[:, 0]).copy()
         velocity[3] = np.nan
         spoilt = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
-        found = sj.identify_backbone(spoilt, MODES)
-        (note,) = (note for note in found.notes if note.kind == "states_without_point")
+        identification = sj.identify_backbone(spoilt, MODES)
+        (note,) = (note for note in identification.notes if note.kind == "states_without_point")
         assert (note["n_states"], note["of"]) == (1, 30)

@@ -47,8 +47,8 @@ class Measured:
             self.natural**2 - self.frequency**2 + 2j * self.damping * self.natural * self.frequency
         )
         self.mode_velocity = 1j * self.constant * self.frequency / self.c
-        turn = np.exp(2j * np.pi * rng.uniform(0, 1, n))
-        self.residual = np.abs(self.mode_velocity) * rng.uniform(0, 3, n) * turn
+        phase_factor = np.exp(2j * np.pi * rng.uniform(0, 1, n))
+        self.residual = np.abs(self.mode_velocity) * rng.uniform(0, 3, n) * phase_factor
         self.velocity = self.mode_velocity + self.residual
         # What the subtraction of the residual leaves in double precision.
         self.difference = self.velocity - self.residual
@@ -101,8 +101,8 @@ def eq_17(natural, damping, frequency, cotangent):
 
 def paper_cotangent(difference):
     """1/tan φ of Eq. (13), from the phasor: an angle would lose digits near −180°."""
-    turned = -1j * difference
-    return turned.real / turned.imag
+    paper = -1j * difference
+    return paper.real / paper.imag
 
 
 def assert_equations(natural, damping, constant, frequency, amplitude, residual, cotangent):
@@ -115,7 +115,7 @@ def assert_equations(natural, damping, constant, frequency, amplitude, residual,
     )
     c = natural**2 - frequency**2 + 2j * damping * natural * frequency
     # ω̃ has 53 bits: ω̃² − Ω², and with it V_nl, is known to ε Ω²/|c| only, however good it is.
-    # Four roundings of it, beside the 1e-10 asked for.
+    # Four roundings of it, in addition to the required 1e-10.
     fraction = np.abs(constant * frequency / c) / amplitude
     rounding = 4 * EPS * np.maximum(natural, frequency) ** 2 / np.abs(c) * fraction
     error = eq_12(natural, damping, constant, frequency, amplitude, residual)
@@ -127,7 +127,7 @@ def assert_equations(natural, damping, constant, frequency, amplitude, residual,
 class TestRandomMeasurements:
     def test_phasors_give_what_satisfies_the_papers_equations(self, measured):
         points = arrays(invert_phasor(*measured.phasors()))
-        # Where the two roots nearly meet, Eq. (12) has nothing to hold on to.
+        # Where the two roots nearly meet, Eq. (12) is ill-conditioned.
         regular = measured.slope > 1e-6
         assert (points.status[regular] == STATUS.OK).all()
         assert np.isin(points.status, [STATUS.OK, STATUS.NOT_CONVERGED]).all()
@@ -183,9 +183,9 @@ class TestRandomMeasurements:
 
         def real_frequency(length):
             # ω̃² = Ω² + Re(AΩ/V) in the paper's phase.
-            turned = AS_PAPER * np.exp(1j * measured.phase)
+            rotated = AS_PAPER * np.exp(1j * measured.phase)
             with np.errstate(divide="ignore"):
-                shift = (measured.constant * measured.frequency / (length * turned)).real
+                shift = (measured.constant * measured.frequency / (length * rotated)).real
             return measured.frequency**2 + shift > 0
 
         two = (smaller > 0) & real_frequency(smaller)
@@ -212,8 +212,8 @@ class TestRandomMeasurements:
         constant = 10.0 ** rng.uniform(-3, 3, N) * rng.choice([-1, 1], N)
         phase = rng.uniform(-np.pi, np.pi, N)
         amplitude = np.abs(constant) / frequency * 10.0 ** rng.uniform(-1, 4, N)
-        turn = np.exp(2j * np.pi * rng.uniform(0, 1, N))
-        residual = amplitude * 10.0 ** rng.uniform(-2, 0.5, N) * turn
+        phase_factor = np.exp(2j * np.pi * rng.uniform(0, 1, N))
+        residual = amplitude * 10.0 ** rng.uniform(-2, 0.5, N) * phase_factor
         points = arrays(invert_amplitude_phase(constant, frequency, amplitude, phase, residual))
         rest = constant, frequency, amplitude, residual, -np.tan(phase)
         assert_equations(points.natural_frequency, points.damping_ratio, *rest)
@@ -232,11 +232,11 @@ class TestRandomMeasurements:
             [STATUS.NO_ROOT, STATUS.NO_REAL_FREQUENCY, STATUS.NEGATIVE_DAMPING],
             STATUS.OK,
         )
-        found = np.where(points.status == STATUS.TWO_ROOTS, STATUS.OK, points.status)
+        actual = np.where(points.status == STATUS.TWO_ROOTS, STATUS.OK, points.status)
         # Both roots equal, ω̃ = 0 and a phase of exactly 90° are drawn with probability zero;
         # 1e-6 keeps clear of rounding at these limits.
         clear = np.abs(chord) > 1e-6 * amplitude**2
-        assert (found == expected)[clear].all()
+        assert (actual == expected)[clear].all()
         kinds, counts = np.unique(points.status, return_counts=True)
         assert (counts > 100).all()
         assert {*kinds} >= {
@@ -246,10 +246,10 @@ class TestRandomMeasurements:
             STATUS.NO_ROOT,
             STATUS.NO_REAL_FREQUENCY,
         }
-        nothing = np.isin(found, [STATUS.NO_ROOT, STATUS.NO_REAL_FREQUENCY])
+        nothing = np.isin(actual, [STATUS.NO_ROOT, STATUS.NO_REAL_FREQUENCY])
         assert (np.isnan(points.natural_frequency) == nothing).all()
-        assert (points.damping_ratio[found == STATUS.NEGATIVE_DAMPING] < 0).all()
-        assert (points.damping_ratio[found == STATUS.OK] >= 0).all()
+        assert (points.damping_ratio[actual == STATUS.NEGATIVE_DAMPING] < 0).all()
+        assert (points.damping_ratio[actual == STATUS.OK] >= 0).all()
 
     def test_the_closed_form_is_the_answer_without_residual(self, measured):
         natural, damping = closed_form(
@@ -289,13 +289,13 @@ class TestEdges:
         assert (points.status == expected)[clear].all()
         assert np.isnan(points.alternative_natural_frequency).all()
 
-    @pytest.mark.parametrize("turn", [1, 1j, -1j])
-    def test_phasors_exactly_along_an_axis(self, turn):
-        point = few_of(invert_phasor, 6.0, 500.0, 0.06 * turn, 0.0)
+    @pytest.mark.parametrize("direction", [1, 1j, -1j])
+    def test_phasors_exactly_along_an_axis(self, direction):
+        point = few_of(invert_phasor, 6.0, 500.0, 0.06 * direction, 0.0)
         assert int(point.status) == STATUS.OK
-        squared = 500.0**2 + 6.0 * 500.0 / 0.06 * complex(turn).imag
+        squared = 500.0**2 + 6.0 * 500.0 / 0.06 * complex(direction).imag
         np.testing.assert_allclose(point.natural_frequency, np.sqrt(squared), rtol=4 * EPS)
-        expected = 0.1 if turn == 1 else 0.0  # A/(2Ωv) at resonance
+        expected = 0.1 if direction == 1 else 0.0  # A/(2Ωv) at resonance
         np.testing.assert_allclose(point.damping_ratio, expected, rtol=4 * EPS, atol=EPS)
 
     def test_light_damping_near_resonance(self):
@@ -319,7 +319,7 @@ class TestEdges:
         np.testing.assert_allclose(points.damping_ratio, 6 / 3000, rtol=1e-14)
         np.testing.assert_allclose(points.alternative_damping_ratio, 6 / 1000, rtol=1e-14)
         for velocity, own, other in ((1.0, 3, 1), (-1.0, 1, 3)):
-            # The phasor says which root is meant; the other one is still shown.
+            # The phasor selects the root; the other one is still reported.
             point = few_of(invert_phasor, 6.0, 500.0, velocity, -2.0)
             assert int(point.status) == STATUS.OK
             np.testing.assert_allclose(point.damping_ratio, 6 / (1000 * own), rtol=1e-14)
@@ -327,7 +327,7 @@ class TestEdges:
                 point.alternative_damping_ratio, 6 / (1000 * other), rtol=1e-14
             )
 
-    def test_where_the_two_roots_meet_nothing_wrong_is_returned(self):
+    def test_no_wrong_value_where_the_two_roots_meet(self):
         # V at right angles to V_nl: |V| does not change with |V_nl| to first order.
         tilt = np.array([0.0, 1e-15, 1e-12, 1e-9, 1e-6, 1e-4, 1e-3])
         velocity, residual = 1.0, 1.0 - (0.5j + 0.5 * tilt)
@@ -338,9 +338,9 @@ class TestEdges:
         assert refused[0]
         assert (points.status[-2:] == STATUS.OK).all()
         truth = 6j * 500.0 / (velocity - residual)
-        found = points.natural_frequency**2 - 500.0**2
+        actual = points.natural_frequency**2 - 500.0**2
         # A root of multiplicity two is known to the square root of rounding.
-        np.testing.assert_allclose(found[~refused], truth.real[~refused], rtol=1e-7)
+        np.testing.assert_allclose(actual[~refused], truth.real[~refused], rtol=1e-7)
 
     @pytest.mark.parametrize(
         ("arguments", "status"),
@@ -403,11 +403,11 @@ class TestShapes:
         ):
             points = arrays(function(*arguments))
             assert {field.shape for field in leaves(points)} == {(2, 3)}
-            for found, expected in zip(
+            for actual, expected in zip(
                 leaves(points), leaves(few_of(function, *arguments)), strict=True
             ):
                 # The compiler may contract operations in one of them.
-                np.testing.assert_allclose(found, expected, rtol=1e-13)
+                np.testing.assert_allclose(actual, expected, rtol=1e-13)
         one = invert_phasor(6.0, 500.0, 0.6 + 0j, 0j)
         assert {field.shape for field in leaves(one)} == {()}
         np.testing.assert_allclose(one.damping_ratio, 0.01, rtol=4 * EPS)
@@ -441,10 +441,10 @@ class TestShapes:
         assert len(traces) == 1
         for points in results:
             np.testing.assert_array_equal(points.status, plain.status)
-            for found, expected in zip(leaves(points)[:4], leaves(plain)[:4], strict=True):
+            for actual, expected in zip(leaves(points)[:4], leaves(plain)[:4], strict=True):
                 # Another order of operations: rounding, amplified where ζ̃ is far from the
                 # phase's axis as in the truth above.
-                np.testing.assert_allclose(found, expected, rtol=1e-9)
+                np.testing.assert_allclose(actual, expected, rtol=1e-9)
 
     def test_one_member_is_the_batch(self, measured):
         few = [jnp.asarray(a[:64]) for a in measured.phasors()]
@@ -464,7 +464,7 @@ class TestShapes:
             (6.0, 500.0, 1.0 + 0j, 1.0 - 0.5j),  # where two roots meet
         ],
     )
-    def test_members_do_not_touch_one_another(self, measured, replaced):
+    def test_members_do_not_affect_one_another(self, measured, replaced):
         few = [a[:64].copy() for a in measured.phasors()]
         few[3][:] = 0.0
         few[2][:] = measured.mode_velocity[:64]
@@ -552,7 +552,7 @@ CASES = np.stack(
         measurement_of(520.0, 0.03, 531.0),  # past resonance
         measurement_of(520.0, 0.03, 520.0),  # at resonance
         measurement_of(480.0, 0.05, 470.0, sign=-1.0),
-        measurement_of(505.0, 0.25, 320.0),  # beside the first mode: the residual is larger
+        measurement_of(505.0, 0.25, 320.0),  # near the first mode: the residual is larger
     ]
 )
 
@@ -580,8 +580,8 @@ class TestDerivatives:
             truth = fourth_order(answer, theta, 1e-5 * np.abs(theta))
             scaled = truth * np.abs(theta)  # per relative change of the input
             size = np.abs(scaled).max(axis=1, keepdims=True)
-            for found in (forward[k], reverse[k]):
-                error = np.abs(found * np.abs(theta) - scaled)
+            for actual in (forward[k], reverse[k]):
+                error = np.abs(actual * np.abs(theta) - scaled)
                 # The differences err by (1e-5/ζ)⁴ and by rounding, 1e-16/1e-5 of the values.
                 assert (error <= 1e-6 * np.abs(scaled) + 1e-10 * size).all()
             # The linear properties of the mode itself are no input.
@@ -614,8 +614,8 @@ class TestDerivatives:
         def few(x):
             return through_package(jnp.concatenate([x, jnp.asarray(theta[measured:])]))
 
-        found = jax.jit(jax.jacfwd(jax.jacrev(few)))(jnp.asarray(theta[:measured]))
-        found = np.asarray(found)
+        actual = jax.jit(jax.jacfwd(jax.jacrev(few)))(jnp.asarray(theta[:measured]))
+        actual = np.asarray(actual)
 
         def slopes(x):
             full = np.concatenate([x, theta[measured:]])
@@ -626,9 +626,9 @@ class TestDerivatives:
         scaled = truth * scale * scale[:, None]
         size = np.abs(scaled).max(axis=(1, 2), keepdims=True)
         # (1e-3/ζ)⁴ = 6e-10 from the steps, 1e-16/1e-6 from rounding.
-        error = np.abs(found * scale * scale[:, None] - scaled)
+        error = np.abs(actual * scale * scale[:, None] - scaled)
         assert (error <= 1e-7 * size).all()
-        np.testing.assert_allclose(found, found.transpose(0, 2, 1), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(actual, actual.transpose(0, 2, 1), rtol=1e-9, atol=1e-12)
 
 
 class TestCramersRule:
@@ -651,10 +651,10 @@ class TestCramersRule:
                 jax.grad(lambda v: solve(matrix, v)[0])(vector),
             )
 
-        found, back, gradient = jax.jit(jax.vmap(both))(matrices, vectors)
+        actual, back, gradient = jax.jit(jax.vmap(both))(matrices, vectors)
         # Cramer's rule in two dimensions: rounding times the condition number.
         condition = np.linalg.cond(matrices)
-        for result, matrix in ((found, matrices), (back, matrices.transpose(0, 2, 1))):
+        for result, matrix in ((actual, matrices), (back, matrices.transpose(0, 2, 1))):
             truth = np.linalg.solve(matrix, vectors[..., None])[..., 0]
             error = np.linalg.norm(result - truth, axis=1) / np.linalg.norm(truth, axis=1)
             assert (error < 8 * EPS * condition).all()

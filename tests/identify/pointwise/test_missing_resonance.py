@@ -1,4 +1,4 @@
-"""Phase resonances that states enclose, and what is said where states have no points."""
+"""Phase resonances bracketed by states, and the message where states have no points."""
 
 import dataclasses
 
@@ -15,10 +15,12 @@ TIP = 2e-3  # m, the largest displacement at resonance
 
 @pytest.fixture(scope="module")
 def identified():
-    """States whose top level says to have had four times the force, and their true curves."""
+    """States whose top level is recorded with four times the force, and their true curves."""
     level, omega, force, velocity = exact(per_level=9)
-    found = sj.identify_backbone(stated(level, omega, force, velocity), modes())
-    return found.backbone, stated(level, omega, np.where(level == 4, 4, 1) * force, velocity)
+    identification = sj.identify_backbone(stated(level, omega, force, velocity), modes())
+    return identification.backbone, stated(
+        level, omega, np.where(level == 4, 4, 1) * force, velocity
+    )
 
 
 def needed(displacement):
@@ -27,7 +29,7 @@ def needed(displacement):
     return displacement * omega * damping(displacement * omega) / CONSTANT
 
 
-def test_a_measured_resonance_that_the_curves_lack_is_found(identified):
+def test_a_measured_resonance_missing_on_the_curves(identified):
     backbone, data = identified
     recorded = 4 * needed(TIP)
     assert resonances(backbone, modes(), recorded) == []
@@ -41,26 +43,26 @@ def test_a_measured_resonance_that_the_curves_lack_is_found(identified):
 def test_levels_on_one_side_have_no_resonance():
     level, omega, force, velocity = exact(per_level=9)
     data = stated(level, omega, force, velocity)
-    found = measured_resonances(data, 0, 1.0)
-    assert [one.level for one in found] == [0, 1, 2, 3, 4]
-    assert found[-1].force == pytest.approx(needed(TIP), rel=1e-9)  # a state lies there
+    measured = measured_resonances(data, 0, 1.0)
+    assert [one.level for one in measured] == [0, 1, 2, 3, 4]
+    assert measured[-1].force == pytest.approx(needed(TIP), rel=1e-9)  # a state lies there
     assert measured_resonances(data.select(np.angle(velocity) > 0.05), 0, 1.0) == []
     assert measured_resonances(data, 0, -1.0) == []
 
 
 @pytest.mark.parametrize(
-    ("participation", "force", "said"),
+    ("participation", "force", "message"),
     [
         (-3.0, 1.0, r"only 0 of 5 are: 5 have negative damping.*`participation`.*wrong sign"),
         (3.0, 1e7, r"no real natural frequency\..*in newtons"),
     ],
 )
-def test_why_no_state_has_a_point_is_said(participation, force, said):
+def test_the_reason_for_states_without_points_is_reported(participation, force, message):
     """Too few states to name wrong phases or units by themselves."""
     level, omega, forces, velocity = (a[20:25] for a in exact(per_level=9, widest=50))
     data = stated(level, omega, forces * force, velocity)
     one = sj.model.linear_modes([OMEGA], [0.012], [[SHAPE]], [participation])
     if force > 1:  # where it leads, a force far too large asks for a negative stiffness
         data = dataclasses.replace(data, velocity=np.abs(data.velocity) * np.exp(-1.4j))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         sj.identify_backbone(data, one)

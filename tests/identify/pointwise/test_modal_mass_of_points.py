@@ -11,9 +11,9 @@ WRONG, STD = 1.06, 0.03  # of the model's modal mass; its stated 1σ
 
 
 def modes(mass=1.0, std=None):
-    """The one mode with a modal mass so many times the true one."""
-    told = None if std is None else sj.model.LinearModesStd(modal_mass=[std])
-    return sj.model.linear_modes([OMEGA], [0.012], [[SHAPE]], [PARTICIPATION / mass], std=told)
+    """The one mode with `mass` times its true modal mass."""
+    stds = None if std is None else sj.model.LinearModesStd(modal_mass=[std])
+    return sj.model.linear_modes([OMEGA], [0.012], [[SHAPE]], [PARTICIPATION / mass], std=stds)
 
 
 def without_noise_stated(data):
@@ -21,8 +21,8 @@ def without_noise_stated(data):
     return sj.measure.steady_states(*(np.asarray(column) for column in columns))
 
 
-def about_mass(found):
-    return [note for note in found.notes if note.kind == "modal_mass_moved"]
+def about_mass(identification):
+    return [note for note in identification.notes if note.kind == "modal_mass_moved"]
 
 
 @pytest.fixture(scope="module")
@@ -36,27 +36,25 @@ def right(data):
 
 
 @pytest.mark.parametrize("noise_stated", [True, False])
-def test_points_include_the_error_of_the_mass_as_a_model_with_that_mass_moves_them(
-    data, noise_stated
-):
-    plain, told = (sj.identify.identify_points(data, modes(std=std)) for std in (None, STD))
+def test_points_propagate_the_error_of_the_modal_mass(data, noise_stated):
+    plain, with_error = (sj.identify.identify_points(data, modes(std=std)) for std in (None, STD))
     if not noise_stated:
         plain = errors_from_scatter(plain, 0.01)
-        told = errors_from_scatter(told, 0.01, modal_mass_std=STD)
-    away = 1e-4
-    moved = sj.identify.identify_points(data, modes(1 + away))
+        with_error = errors_from_scatter(with_error, 0.01, modal_mass_std=STD)
+    step = 1e-4
+    moved = sj.identify.identify_points(data, modes(1 + step))
     for name in ("natural_frequency", "damping_ratio"):
         values = np.asarray(getattr(plain, name))
-        by_mass = (np.asarray(getattr(moved, name)) - values) / away
-        own, all_ = (np.asarray(getattr(one, f"{name}_std")) for one in (plain, told))
-        # The difference quotient's own error: half of 1e-4. A damping ratio that was read off the
-        # scatter has the natural frequency's error, too.
+        by_mass = (np.asarray(getattr(moved, name)) - values) / step
+        own, all_ = (np.asarray(getattr(one, f"{name}_std")) for one in (plain, with_error))
+        # Error of the difference quotient: half of 1e-4. A damping ratio with errors from the
+        # scatter has the natural frequency's error in addition.
         np.testing.assert_allclose(
             np.sqrt(all_**2 - own**2), STD * abs(by_mass), rtol=2e-4 if noise_stated else 0.02
         )
 
 
-def test_another_mass_is_said_where_the_states_ask_for_it(data, right):
+def test_another_mass_is_reported_where_the_states_contradict_the_model(data, right):
     assert about_mass(right) == []
     for states in (data, without_noise_stated(data)):
         (note,) = about_mass(sj.identify_backbone(states, modes(WRONG)))
@@ -65,26 +63,28 @@ def test_another_mass_is_said_where_the_states_ask_for_it(data, right):
         assert note["model_kg"] == pytest.approx(WRONG * true)
 
 
-def test_exact_states_tell_the_mass_itself():
-    found = sj.identify_backbone(noisy(), modes(WRONG))
-    assert float(found.backbone.modal_constant) == pytest.approx(SHAPE * PARTICIPATION, rel=1e-3)
+def test_exact_states_determine_the_mass():
+    identification = sj.identify_backbone(noisy(), modes(WRONG))
+    assert float(identification.backbone.modal_constant) == pytest.approx(
+        SHAPE * PARTICIPATION, rel=1e-3
+    )
 
 
-def test_states_near_resonance_say_nothing_of_the_mass():
+def test_states_near_resonance_do_not_determine_the_mass():
     level, omega, force, velocity = exact(per_level=9, widest=8)
     rng = np.random.default_rng(1)
     noise = NOISE["velocity"] * rng.normal(size=len(level))
-    found = sj.identify_backbone(
+    identification = sj.identify_backbone(
         stated(level, omega, force, velocity * np.exp(noise)), modes(WRONG)
     )
-    assert about_mass(found) == []
+    assert about_mass(identification) == []
 
 
 @pytest.mark.long
-def test_levels_of_another_gain_ask_for_no_mass():
-    """60 tests with level gains of 1 % that nobody states: 3σ is by chance once in 370."""
-    said = [
+def test_levels_with_gain_errors_do_not_suggest_another_mass():
+    """60 tests with unstated level gains of 1 %: 3σ by chance once in 370."""
+    reported = [
         bool(about_mass(sj.identify_backbone(without_noise_stated(noisy(k, gain=0.01)), modes())))
         for k in range(60)
     ]
-    assert sum(said) <= 3
+    assert sum(reported) <= 3

@@ -133,17 +133,17 @@ class TestResonances:
         load = (CONSTANT * force / RATE) ** 2
         roots = np.roots([b, W0**2, -load])
         u = roots[roots > 0][0]
-        (found,) = resonances(DUFFING, MODES, force)
+        (predicted,) = resonances(DUFFING, MODES, force)
         frequency = np.sqrt(W0**2 + b * u)
         # The companion matrix and Newton's method: a few roundings.
-        np.testing.assert_allclose(found.amplitude, np.sqrt(u), rtol=1e-10)
-        np.testing.assert_allclose(found.frequency, frequency, rtol=1e-12)
-        np.testing.assert_allclose(found.damping_ratio, RATE / (2 * frequency), rtol=1e-10)
-        assert found.continued == (part > 1.0)
-        assert found.force == force
+        np.testing.assert_allclose(predicted.amplitude, np.sqrt(u), rtol=1e-10)
+        np.testing.assert_allclose(predicted.frequency, frequency, rtol=1e-12)
+        np.testing.assert_allclose(predicted.damping_ratio, RATE / (2 * frequency), rtol=1e-10)
+        assert predicted.continued == (part > 1.0)
+        assert predicted.force == force
         own = np.sign(CONSTANT) * frequency * np.sqrt(u)  # in phase or in antiphase
         rest = residual_velocity(MODES, jnp.asarray(frequency), jnp.asarray(force))
-        np.testing.assert_allclose(found.velocity, abs(own + complex(rest[0])), rtol=1e-10)
+        np.testing.assert_allclose(predicted.velocity, abs(own + complex(rest[0])), rtol=1e-10)
 
     def test_resonance_with_growing_damping_is_the_root_of_a_cubic(self):
         which = backbone(W0**2 * line(0.0), RATE * line(2.0))
@@ -152,8 +152,8 @@ class TestResonances:
             # ω0 a (δ0 + 2 δ0 (a/largest)²) = |A|F
             roots = np.roots([2 * RATE * W0, 0, RATE * W0, -abs(CONSTANT) * force / LARGEST])
             (root,) = roots[np.isreal(roots)].real
-            (found,) = resonances(which, MODES, force)
-            np.testing.assert_allclose(found.amplitude, root * LARGEST, rtol=1e-10)
+            (predicted,) = resonances(which, MODES, force)
+            np.testing.assert_allclose(predicted.amplitude, root * LARGEST, rtol=1e-10)
 
     @pytest.mark.parametrize("name", list(BACKBONES))
     def test_all_of_them_by_scipy(self, name):
@@ -162,11 +162,11 @@ class TestResonances:
         for part in (0.02, 0.2, 0.32, 0.9, 1.0):
             force = force_for(which, part)
             truth = all_resonances(which, force)
-            found = resonances(which, MODES, force)
+            predicted = resonances(which, MODES, force)
             counts.add(len(truth))
-            np.testing.assert_allclose([one.amplitude for one in found], truth, rtol=1e-10)
+            np.testing.assert_allclose([one.amplitude for one in predicted], truth, rtol=1e-10)
             squared, damping = curves(which)
-            for one, a in zip(found, truth, strict=True):
+            for one, a in zip(predicted, truth, strict=True):
                 np.testing.assert_allclose(one.frequency, np.sqrt(squared(a)), rtol=1e-10)
                 np.testing.assert_allclose(
                     one.damping_ratio, damping(a) / (2 * np.sqrt(squared(a))), rtol=1e-10
@@ -175,8 +175,8 @@ class TestResonances:
 
     def test_small_forces_have_a_resonance_too(self):
         for part in (1e-4, 1e-7):
-            (found,) = resonances(DUFFING, MODES, force_for(DUFFING, part))
-            np.testing.assert_allclose(found.amplitude, part * LARGEST, rtol=1e-10)
+            (predicted,) = resonances(DUFFING, MODES, force_for(DUFFING, part))
+            np.testing.assert_allclose(predicted.amplitude, part * LARGEST, rtol=1e-10)
 
     def test_a_force_beyond_the_continued_curve_has_none(self):
         force = force_for(DUFFING, 1.01 * LARGEST_AMPLITUDE_RATIO)
@@ -189,9 +189,9 @@ class TestResonances:
         # Beyond the knots ω̃² continues along a², in which the Duffing backbone is a line already,
         # and the damping is constant: the extrapolation is exact.
         force = force_for(DUFFING, 3.7)
-        (found,) = resonances(DUFFING, MODES, force, largest_amplitude_ratio=4.0)
-        np.testing.assert_allclose(found.amplitude, 3.7 * LARGEST, rtol=1e-10)
-        assert found.continued
+        (predicted,) = resonances(DUFFING, MODES, force, largest_amplitude_ratio=4.0)
+        np.testing.assert_allclose(predicted.amplitude, 3.7 * LARGEST, rtol=1e-10)
+        assert predicted.continued
         assert not resonances(DUFFING, MODES, force, largest_amplitude_ratio=3.6)
 
     def test_a_curve_reaches_as_far_as_asked_and_says_where_it_extrapolates(self):
@@ -244,9 +244,9 @@ class TestResponse:
     def test_every_point_satisfies_the_force_balance(self, name, part):
         which = BACKBONES[name]
         force = force_for(which, part)
-        found = predict(which, MODES, force)
+        predicted = predict(which, MODES, force)
         squared, damping = curves(which)
-        for curve in found:
+        for curve in predicted:
             assert curve.frequency.size > 100
             # Ω² = middle ± root: rounding of ω̃², grown by ω̃/δ = 50 near resonance.
             np.testing.assert_allclose(force_balance(which, curve), 0.0, atol=1e-10)
@@ -262,7 +262,7 @@ class TestResponse:
             clear = np.abs(omega / np.sqrt(squared(a)) - 1) > 1e-9
             np.testing.assert_array_equal(lead[clear], below[clear])
             np.testing.assert_array_equal(curve.continued, a > float(which.largest) * (1 + 1e-9))
-        peak = max(curve.amplitude.max() for curve in found)
+        peak = max(curve.amplitude.max() for curve in predicted)
         reached = max(all_resonances(which, force))
         # The largest amplitude is within δ²/8ω² of the phase resonance.
         np.testing.assert_allclose(peak, reached, rtol=(damping(reached) / W0) ** 2)
@@ -420,12 +420,12 @@ class TestStability:
         # 2δ + a δ' < 0 where damping falls faster than the square of the amplitude.
         which = backbone(W0**2 * line(0.0), RATE * np.array([1.0, 1.0, 0.9, 0.1, 0.1]))
         _, damping = curves(which)
-        found = predict(which, MODES, force_for(which, 0.3))
-        for curve in found:
+        predicted = predict(which, MODES, force_for(which, 0.3))
+        for curve in predicted:
             a, h = curve.amplitude, 1e-6 * curve.amplitude
             slope = (damping(a + h) - damping(a - h)) / (2 * h)
             trace = 2 * damping(a) + a * slope
             assert not curve.stable[trace < -1e-3 * RATE].any()
-        every = np.concatenate([curve.stable for curve in found])
+        every = np.concatenate([curve.stable for curve in predicted])
         assert every.any()
         assert not every.all()

@@ -1,4 +1,4 @@
-"""What the results of an identification say, label and show."""
+"""Summaries, labels and plots of the results of an identification."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ MODES = sj.model.linear_modes([500.0], [0.01], [[2.0]], [3.0], sensors=("tip",))
 
 
 @pytest.fixture(scope="module")
-def found():
+def identification():
     """Two levels of a linear mode, with a state that was not measured and a note of the reader."""
     frequency = np.tile(np.linspace(495.0, 505.0, N // 2), 2)
     force = np.repeat([1.0, 2.0], N // 2)
@@ -29,27 +29,27 @@ def found():
     return sj.identify_backbone(dataclasses.replace(data, notes=("read so",)), MODES)
 
 
-def test_the_identification(found):
-    assert repr(found).startswith("Identification: 12 steady states of 2 levels at 'tip'")
-    assert "11 ok" in repr(found)
-    assert found.notes[0] == "read so"
-    data = found.to_xarray()
+def test_the_identification(identification):
+    assert repr(identification).startswith("Identification: 12 steady states of 2 levels at 'tip'")
+    assert "11 ok" in repr(identification)
+    assert identification.notes[0] == "read so"
+    data = identification.to_xarray()
     assert data.natural_frequency_hz.attrs["units"] == "Hz"
     np.testing.assert_allclose(data.natural_frequency_hz.max(), 500.0 / (2 * np.pi), rtol=1e-9)
     assert data.status.values[2] == "not_finite"
-    assert isinstance(found.plot(), Figure)
+    assert isinstance(identification.plot(), Figure)
 
 
-def test_the_points(found):
-    assert repr(found.points).startswith("BackbonePoints: 12 states")
-    table = found.points.to_pandas()
+def test_the_points(identification):
+    assert repr(identification.points).startswith("BackbonePoints: 12 states")
+    table = identification.points.to_pandas()
     assert len(table) == N
     assert {"level", "frequency_hz", "force_n", "damping_ratio_std", "status"} <= set(table.columns)
-    assert isinstance(found.points.plot(), Figure)
+    assert isinstance(identification.points.plot(), Figure)
 
 
-def test_the_curves(found):
-    backbone = found.backbone
+def test_the_curves(identification):
+    backbone = identification.backbone
     values = backbone.values(np.linspace(0.5, 1.0, 7) * float(backbone.largest))
     for result in (backbone, values):
         assert "natural frequency 79.577" in repr(result)
@@ -58,8 +58,8 @@ def test_the_curves(found):
     assert len(values.to_pandas()) == 7
 
 
-def test_predictions(found):
-    backbone = found.backbone
+def test_predictions(identification):
+    backbone = identification.backbone
     (tip,) = sj.identify.resonances(backbone, MODES, 1.5)
     assert "frequency 79.57" in repr(tip)
     assert tip.to_xarray().velocity_m_s.attrs["units"] == "m/s"

@@ -58,16 +58,16 @@ def test_with_linear_properties_it_is_the_response_of_the_structure(mode_of_inte
     modes = chain(mode_of_interest)
     natural = jnp.full(40, NATURAL[mode_of_interest])
     damping = jnp.full(40, DAMPING[mode_of_interest])
-    found = snrm(modes, natural, damping, jnp.asarray(FREQUENCY), jnp.asarray(FORCE))
+    actual = snrm(modes, natural, damping, jnp.asarray(FREQUENCY), jnp.asarray(FORCE))
     truth = np.array([chain_velocity(w, f) for w, f in zip(FREQUENCY, FORCE, strict=True)])
     # Rounding (2e-16) times the condition of the dynamic stiffness, up to 1e3 near resonance.
-    np.testing.assert_allclose(found, truth, rtol=1e-12, atol=1e-12 * np.abs(truth).max())
+    np.testing.assert_allclose(actual, truth, rtol=1e-12, atol=1e-12 * np.abs(truth).max())
     # The same sum in another order.
     linear = linear_response(modes, jnp.asarray(FREQUENCY), jnp.asarray(FORCE))
-    np.testing.assert_allclose(found, linear, rtol=1e-13, atol=1e-13 * np.abs(truth).max())
+    np.testing.assert_allclose(actual, linear, rtol=1e-13, atol=1e-13 * np.abs(truth).max())
 
 
-def test_the_phase_is_the_papers_turned_by_90_degrees():
+def test_the_phase_is_the_papers_plus_90_degrees():
     rng = np.random.default_rng(0)
     natural, frequency = 500 * 2 ** rng.uniform(-1, 1, (2, 200))
     damping, constant = 10 ** rng.uniform(-5, -0.5, 200), rng.uniform(0.1, 9, 200)
@@ -88,7 +88,7 @@ def test_resonance_is_at_zero_and_the_velocity_leads_below():
     assert np.angle(below) > 0 > np.angle(above)
 
 
-def test_a_negative_modal_constant_turns_the_phase_by_180_degrees():
+def test_a_negative_modal_constant_shifts_the_phase_by_180_degrees():
     frequency = jnp.linspace(300.0, 700.0, 21)
     positive = nonlinear_mode_velocity(3.0, 500.0, 0.02, frequency)
     negative = nonlinear_mode_velocity(-3.0, 500.0, 0.02, frequency)
@@ -108,19 +108,19 @@ def test_the_rigid_body_term_is_that_of_a_free_mass_and_of_the_paper():
         [1.0],
         rigid_body=RigidBodyModes(shape, shape[0]),
     )
-    found = complex(snrm(modes, 500.0, 0.01, jnp.array(omega), jnp.array(force))[0])
+    actual = complex(snrm(modes, 500.0, 0.01, jnp.array(omega), jnp.array(force))[0])
     # Eq. (10b), as printed: −Φ Φᵀ F / Ω. One product and one quotient.
-    np.testing.assert_allclose(-1j * found, -(shape[0, 0] ** 2) * force / omega, rtol=1e-15)
+    np.testing.assert_allclose(-1j * actual, -(shape[0, 0] ** 2) * force / omega, rtol=1e-15)
     # Newton's law, m dv/dt = F cos Ωt from the velocity that has no mean.
     steady = scipy.integrate.solve_ivp(
         lambda t, v: [force * np.cos(omega * t) / mass],
         (0.0, 0.5),
-        [found.real],
+        [actual.real],
         t_eval=np.linspace(0, 0.5, 30),
         rtol=1e-10,
         atol=1e-12,
     )
-    signal = (found * np.exp(1j * omega * steady.t)).real
+    signal = (actual * np.exp(1j * omega * steady.t)).real
     np.testing.assert_allclose(steady.y[0], signal, atol=1e-9)  # the integrator's tolerance
 
 
@@ -212,7 +212,7 @@ def test_derivatives_against_central_differences():
         np.testing.assert_allclose(derivative[:, k], slope, rtol=1e-6)
 
 
-def test_the_reference_sensor_sees_the_mode_best():
+def test_the_reference_sensor_has_the_largest_shape():
     shape = [[9.0, 1.0], [0.1, -3.0], [0.2, 2.0]]
     for mode, sensor in ((0, 0), (1, 1)):
         modes = linear_modes([1.0, 2.0], [0.1, 0.1], shape, [1.0, 1.0], mode_of_interest=mode)

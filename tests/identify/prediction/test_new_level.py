@@ -1,4 +1,4 @@
-"""Errors of a level that was not measured: finite differences, and levels left out."""
+"""Errors of a level that was not measured: finite differences, and withheld levels."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from truths.levels_with_errors import drawn_levels, measured
 
 import snrmjax as sj
 from snrmjax.identify.prediction.new_level import DayToDay, NewLevel, new_level
-from snrmjax.model.modes import Beside
+from snrmjax.model.modes import OptionalModalData
 
 FORCE = 1.5  # N, below the folds
 
@@ -34,7 +34,7 @@ def fit():
 
 
 def with_levels(fit, std, deviations=None):
-    """The fit with levels that differ by 1σ of so much, and have some deviations."""
+    """The fit with these 1σ and deviations of level errors."""
     of_levels = jnp.asarray(std)
     prior = dataclasses.replace(fit.prior, level=of_levels, new_level=of_levels)
     scattering = dataclasses.replace(fit, problem=dataclasses.replace(fit.problem, prior=prior))
@@ -50,9 +50,9 @@ def bisected(force, stiffness=0.0, loss=0.0, phase=0.0):
         x = 0.5 * (low + high)
         omega, own = np.sqrt(squared(x) * (1 + stiffness)), squared(x) * (1 + stiffness)
         for _ in range(20):
-            lost = damping(x * omega) * (1 + loss)
-            omega = np.sqrt(own + omega * lost * np.tan(phase))
-        needed = x * omega * lost / np.cos(phase) / CONSTANT
+            modal_damping = damping(x * omega) * (1 + loss)
+            omega = np.sqrt(own + omega * modal_damping * np.tan(phase))
+        needed = x * omega * modal_damping / np.cos(phase) / CONSTANT
         low, high = (x, high) if needed < force else (low, x)
     return np.array([omega, x * omega])
 
@@ -60,7 +60,7 @@ def bisected(force, stiffness=0.0, loss=0.0, phase=0.0):
 @pytest.mark.parametrize(
     ("kind", "error"), [(0, None), (1, "phase"), (2, "stiffness"), (3, "loss")]
 )
-def test_a_resonance_holds_the_levels_errors(fit, kind, error):
+def test_the_band_of_a_resonance_includes_level_errors(fit, kind, error):
     std = 0.02 * (np.arange(4) == kind)
     tip = sj.identify.fitted_response(fit, FORCE, of=NewLevel(std))[0].resonances[0]
     step = 1e-5
@@ -88,20 +88,20 @@ def test_a_distribution_of_small_errors_is_the_band(fit):
     assert one.probability == 1.0
 
 
-def test_a_band_along_a_response_holds_the_levels_errors(fit):
+def test_the_band_along_a_response_includes_level_errors(fit):
     std = np.array([0.0, 0.0, 0.0, 0.05])
     wide, plain = (
         sj.identify.fitted_response(fit, FORCE, of=NewLevel(one))[0] for one in (std, 0 * std)
     )
     tip = int(np.argmax(np.abs(plain.velocity)))
     extra = np.sqrt(wide.velocity_std**2 - plain.velocity_std**2) / np.abs(plain.velocity)
-    # At the tip of nearly linear damping the velocity falls with it, far off it does not.
+    # At resonance the velocity falls with the damping, far off resonance it does not.
     assert 0.03 < extra[tip] < 0.06
     assert extra[10] < 0.01
 
 
 @pytest.mark.long
-def test_a_record_of_the_force_brings_the_gain(fit):
+def test_a_recorded_force_adds_the_gain_error(fit):
     driven_fit = sj.fit_jointly(driven(60), modes(), **TRUE)
     force = 2.0
     given, recorded = (new_level(driven_fit, force, as_recorded=one) for one in (False, True))
@@ -112,7 +112,7 @@ def test_a_record_of_the_force_brings_the_gain(fit):
         for one in (given, recorded)
     )
     assert wide.frequency == pytest.approx(alone.frequency, rel=1e-9)
-    # Damping and gain are known together: what the drive leaves open is less than the force does.
+    # Damping and gain are correlated: the drive leaves less uncertainty than the force.
     drawn = sj.identify.predicted_resonance(driven_fit, force, of=recorded)
     half = 0.5 * (drawn.velocity[3] - drawn.velocity[1])
     assert half == pytest.approx(wide.velocity_std, rel=0.06)
@@ -130,7 +130,7 @@ def test_another_day_adds_its_own_errors(fit):
     assert sj.identify.predicted_resonance(some, FORCE, of=one).holds["another_day"]
 
 
-def test_levels_that_rise_with_their_force_are_a_law(fit):
+def test_level_errors_correlated_with_force_are_a_trend(fit):
     level = np.asarray(fit.data.level)
     force = np.array([np.median(np.asarray(fit.data.force)[level == k]) for k in range(5)])
     rising = np.zeros((5, 4))
@@ -166,13 +166,13 @@ def test_left_out_levels_lie_inside_their_bands():
 
 
 @pytest.mark.long
-def test_a_force_at_another_point_moves_the_same_mode_otherwise():
+def test_a_force_at_another_point_scales_the_participation():
     # A second linear mode at 900 rad/s; the test's force acts at `a`, where the modes' shapes are
     # those of the sensor, the predicted one at `b`.
     shape = {"a": [2.0, 1.1], "b": [-0.7, 3.0]}
     second, tested, force = (900.0, 0.01), np.prod(np.array([shape["a"]] * 2), axis=0), 6.0
 
-    def beside(omega, constant):
+    def second_mode(omega, constant):
         return 1j * omega * constant / (second[0] ** 2 - omega**2 + 2j * np.prod(second) * omega)
 
     level, omega, forces, own = exact()
@@ -180,9 +180,9 @@ def test_a_force_at_another_point_moves_the_same_mode_otherwise():
     linear = sj.model.linear_modes(
         *([500.0, 900.0], [0.012, 0.01], [shape["a"]], shape["a"]),
         sensors=("a",),
-        beside=Beside({"b": shape["b"]}),
+        beside=OptionalModalData({"b": shape["b"]}),
     )
-    velocity = own + forces * beside(omega, tested[1])
+    velocity = own + forces * second_mode(omega, tested[1])
     data = stated(level, omega, forces, velocity, sensors=("a",))
     fit = sj.fit_jointly(data, linear, **TRUE)
     elsewhere = new_level(fit, force, at="b")
@@ -190,7 +190,7 @@ def test_a_force_at_another_point_moves_the_same_mode_otherwise():
     x, omega = np.asarray(curve.amplitude), np.asarray(curve.frequency)
     of_mode = -1.4 / (squared(x) - omega**2 + 1j * omega * damping(x * omega))
     np.testing.assert_allclose(force * np.abs(of_mode), x, rtol=1e-4)
-    expected = force * (1j * omega * of_mode + beside(omega, 3.3))
+    expected = force * (1j * omega * of_mode + second_mode(omega, 3.3))
     np.testing.assert_allclose(curve.velocity, expected, rtol=1e-3)
     (tip,) = curve.resonances
     np.testing.assert_allclose(

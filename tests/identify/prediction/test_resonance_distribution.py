@@ -1,4 +1,4 @@
-"""Resonances as distributions against closed forms, by other means than drawing curves."""
+"""Distributions of a resonance, against closed forms and quadrature."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +23,7 @@ from snrmjax.identify.prediction.resonance_distribution import (
 
 OMEGA, DELTA = 500.0, 12.0
 AMPLITUDE = amplitudes_to(1.0, 2.0)
-# 4000 draws know a quantile at 2.5 % to sqrt(0.025·0.975/4000)/pdf = 0.042σ: three times that.
+# 4000 draws determine a quantile at 2.5 % to sqrt(0.025·0.975/4000)/pdf = 0.042σ: three times that.
 DRAWN = 0.13
 _TESTS = 120
 
@@ -42,7 +42,7 @@ def curves(damping, errors=None, load=OMEGA * DELTA * 0.5):
 
 
 def found(given, *, new=ON_THE_CURVES, **settings):
-    """The distribution of some curves up to twice the largest amplitude."""
+    """The distribution for these curves up to twice the largest amplitude."""
     return resonance_distribution(
         2.0, AMPLITUDE, given, new, no_other, **{"ratio": 2.0, **settings}
     )
@@ -52,7 +52,7 @@ def test_without_errors_it_is_the_resonance_itself():
     one = found(curves(np.full(len(AMPLITUDE), DELTA)))
     assert one.probability == 1.0
     np.testing.assert_allclose(one.frequency, OMEGA, rtol=1e-12)
-    # Straight between amplitudes of a force that rises in proportion: exact.
+    # Linear interpolation of a proportional force: exact.
     np.testing.assert_allclose(one.velocity, 0.5 * OMEGA, rtol=1e-12)
     assert where_in_words(one)["sure"]
 
@@ -68,7 +68,7 @@ def test_without_errors_it_is_the_resonance_itself():
         (3, None, 0.0, -1.0),
     ],
 )
-def test_a_levels_errors_are_in_it(kind, drive, of_frequency, of_velocity):
+def test_level_errors_are_included(kind, drive, of_frequency, of_velocity):
     std = 0.05 * (np.arange(4) == kind)
     new = NewLevel(std, drive)
     one = found(curves(np.full(len(AMPLITUDE), DELTA)), new=new, gain_of_force=drive is not None)
@@ -86,7 +86,7 @@ def test_a_levels_errors_are_in_it(kind, drive, of_frequency, of_velocity):
     )
 
 
-def test_a_gain_of_the_force_is_none_of_a_force_that_is_given():
+def test_a_force_gain_does_not_affect_a_given_force():
     std = np.array([0.05, 0, 0, 0])
     one = found(curves(np.full(len(AMPLITUDE), DELTA)), new=NewLevel(std), gain_of_force=True)
     assert np.ptp(one.velocity) < 1e-9
@@ -97,7 +97,7 @@ def falling(slope):
     return DELTA * (1 - np.multiply.outer(slope, AMPLITUDE))
 
 
-def test_damping_that_extrapolates_through_zero_is_no_absence():
+def test_rejecting_negative_damping_keeps_the_probability():
     """δ = δ₀(1 − s x), s = 0.6 ± 0.2: by quadrature over s, with the root in closed form."""
     load = 0.55  # in units of ω̃δ₀ at an amplitude of one
     one = found(
@@ -109,7 +109,7 @@ def test_damping_that_extrapolates_through_zero_is_no_absence():
     root = np.where(inner >= 0, 2 * load / (1 + np.sqrt(np.maximum(inner, 0))), np.inf)
     has = root <= 2.0
     passive = has | (1 - 2.0 * s > 0)
-    # The twentieth that stops at x = 1: x(1 − s) = load beyond it.
+    # The twentieth with constant damping beyond x = 1: x(1 − s) = load there.
     late = np.where(root <= 1, root, load / (1 - s))
     late_has = (late <= 2.0) & (late > 0)
     late_passive = late_has | (s < 1)
@@ -123,16 +123,16 @@ def test_damping_that_extrapolates_through_zero_is_no_absence():
     assert notes_on_resonance(one, "2 N")[0]["fraction"] == one.negative_damping
 
 
-def test_a_law_that_has_no_damping_left_gives_way_to_one_that_stops():
-    """Every draw of the law falls through zero first: what is left holds damping at the end."""
+def test_constant_damping_remains_where_extrapolation_is_negative():
+    """Every extrapolated draw becomes negative first: only those with constant damping remain."""
     one = found(curves(falling(0.9), load=0.5 * OMEGA * DELTA), ratio=2.0)
     edge = np.searchsorted(AMPLITUDE, 1.0)
     assert one.probability == 0.0  # 0.5/0.1 times the largest amplitude is beyond twice it
     assert one.negative_damping == pytest.approx(0.95, abs=1e-3)
     near = found(curves(falling(0.6), load=0.43 * OMEGA * DELTA), ratio=2.0)
-    held = 1 - 0.6 * AMPLITUDE[edge]
+    constant = 1 - 0.6 * AMPLITUDE[edge]
     assert near.probability == 1.0
-    np.testing.assert_allclose(near.velocity, 0.43 / held * OMEGA, rtol=1e-9)
+    np.testing.assert_allclose(near.velocity, 0.43 / constant * OMEGA, rtol=1e-9)
 
 
 def test_a_self_excited_structure_may_have_negative_damping():
@@ -163,15 +163,15 @@ def test_curves_through_points_predict_their_own_resonances():
     assert day.another_day
     assert where_in_words(day)["another_day"]
     widened, before = (np.diff(np.log(d.frequency[[1, 3]]))[0] / 2 for d in (day, plain))
-    # Frequency 1 % higher is stiffness 2 %, at whose smaller displacement the mode hardens less.
+    # 1 % of frequency is 2 % of stiffness; the smaller displacement then hardens less.
     stiff, soft = (Level(2.2, 0.0, 0.02 * sign, 0.0).resonance()[0] for sign in (0.5, -0.5))
     expected = np.log(stiff / soft)
-    # 4000 draws know half a 68 % range to 2 %.
+    # 4000 draws determine half a 68 % range to 2 %.
     assert np.sqrt(widened**2 - before**2) == pytest.approx(expected, rel=0.06)
 
 
-def test_ninety_five_per_cent_hold_a_left_out_level():
-    """Levels whose stiffness and damping err by known 1σ, a straight line through the others."""
+def test_the_95_per_cent_interval_covers_a_withheld_level():
+    """Levels with known 1σ of stiffness and damping, predicted by a line through the others."""
     rng, std = np.random.default_rng(1), np.array([0.0, 0.0, 0.004, 0.08])
     at, inside = np.array([0.3, 0.5, 0.7, 0.85, 1.0]), np.zeros(2)
     columns = np.column_stack([np.ones(5), at])
@@ -204,7 +204,7 @@ def values_of(ratio, std):
     return BackboneValues(*map(jnp.asarray, columns))
 
 
-def test_negative_damping_is_said_once_with_its_probability():
+def test_negative_damping_is_noted_once_with_its_probability():
     assert notes_on_negative_damping(values_of([0.01, 0.02, 0.03], [0.001] * 3)) == []
     (note,) = notes_on_negative_damping(values_of([-6.6e-5, 1e-3, 1e-5], [1.9e-4] * 3))
     assert (note["velocity"], note["ratio"], note["ratio_std"]) == (0.0, -6.6e-5, 1.9e-4)

@@ -1,4 +1,4 @@
-"""Mass-normalised shapes by each way, against the mass matrix of a chain."""
+"""Mass-normalised shapes by each method, against the mass matrix of a chain."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import linear_response
-from snrmjax.pipelines.modes import _asked_scale
+from snrmjax.pipelines.modes import _requested_scale
 from snrmjax.pipelines.options import ModesOptions
 
 MASSES = [1.0, 1.2, 0.8]
@@ -53,26 +53,26 @@ def agrees(scaled, driven=0, rtol=1e-5):
     assert np.allclose(scaled.participation, exact[driven], rtol=rtol)
 
 
-def test_the_drive_point_is_found_by_point_and_axis():
+def test_the_drive_point_is_recognised_by_point_and_axis():
     agrees(scale_modes(FIT, DrivePoint()))
     agrees(scale_modes(fit_linear_modes(over_force(driven=2)), DrivePoint("s3")), driven=2)
 
 
-def test_a_turned_drive_point():
-    turned = over_force()
-    values = turned.values * np.array([-1.0, 1.0, 1.0])[:, None, None]
+def test_a_reversed_drive_point():
+    reversed_ = over_force()
+    values = reversed_.values * np.array([-1.0, 1.0, 1.0])[:, None, None]
     against = [channels()[0]._replace(direction="-z"), *channels()[1:]]
-    fit = fit_linear_modes(frequency_responses(LINES, values, against, turned.references))
+    fit = fit_linear_modes(frequency_responses(LINES, values, against, reversed_.references))
     scaled = scale_modes(fit, DrivePoint())
     assert np.allclose(scaled.shape[1:], SHAPES[1:], rtol=1e-5)
     assert np.allclose(scaled.shape[0], -SHAPES[0], rtol=1e-5)
-    with pytest.raises(ValueError, match=r"negative.*; say that the sensor is turned, or"):
+    with pytest.raises(ValueError, match=r"negative.*; state that the sensor is turned, or"):
         scale_modes(fit, DrivePoint("s1"))
     with pytest.raises(ValueError, match=r"negative.*; leave out that the sensor is turned, or"):
         scale_modes(FIT, DrivePoint("s1", turned=True))
 
 
-def test_the_model_answers_as_the_structure():
+def test_the_model_responds_as_the_structure():
     modes = scale_modes(FIT, DrivePoint()).linear_modes()
     omega = np.array([30.0, 60.0, 90.0]) * HERTZ
     velocity = np.asarray(linear_response(modes, omega, np.full(3, 2.0)))
@@ -90,11 +90,11 @@ def test_an_added_mass(mass):
     sign = np.sign(scaled.shape[0] * SHAPES[0])
     assert np.allclose(scaled.shape * sign, SHAPES, rtol=1e-4)
     assert np.allclose(scaled.participation * sign, SHAPES[2], rtol=1e-4)
-    # The first-order formula errs by 3/2 of the relative shift: the note says by how much.
+    # The first-order formula errs by 3/2 of the relative shift: the note states it.
     shift = 1 - heavier.natural_frequency / STRUCTURE.natural_frequency
     first = 2 * shift / mass / SHAPES[1] ** 2 - 1
-    said = [note["first_order"] for note in scaled.notes if note.kind == "added_mass_shift"]
-    assert np.allclose(said, first, atol=0.02 * np.abs(first).max() + 1e-4)
+    stated = [note["first_order"] for note in scaled.notes if note.kind == "added_mass_shift"]
+    assert np.allclose(stated, first, atol=0.02 * np.abs(first).max() + 1e-4)
 
 
 @pytest.mark.long
@@ -126,8 +126,8 @@ def test_base_motion_by_the_masses_at_the_sensors():
     # Displacement over the base's displacement: -Ω² times that over its acceleration.
     over = -(omega**2) * absolute
     raw = frequency_responses(omega, over[:, None], channels(), [Channel("table", "displacement")])
-    turned = relative_to_base(raw, "absolute").responses.receptance()
-    assert np.allclose(turned[:, 0], relative, rtol=1e-9)
+    receptance = relative_to_base(raw, "absolute").responses.receptance()
+    assert np.allclose(receptance[:, 0], relative, rtol=1e-9)
     gamma = STRUCTURE.shapes.T @ np.diag(STRUCTURE.mass)
     exact = STRUCTURE.shapes * np.sign(gamma)
     for motion, values, quantity in (
@@ -184,7 +184,7 @@ def test_a_drive_voltage_with_and_without_calibration():
     relative = scale_modes(fit, None)
     assert not relative.mass_normalised
     assert np.allclose(np.abs(relative.shape).max(axis=0), 1.0)
-    # Modes that move against their force keep their sign, though nobody knows their scale.
+    # Modes that move against their force keep their sign, although their scale is unknown.
     products = STRUCTURE.shapes * STRUCTURE.shapes[0]
     assert np.allclose(relative.shape * relative.participation, 4.0 * products, rtol=1e-4)
     assert np.all(relative.participation > 0)
@@ -240,28 +240,28 @@ def states(curve, levels=(1.0, 3.0), rng=None):
 def test_the_lowest_level_of_steady_states():
     data = states(0.0)
     assert levels_by_velocity(data) == [1, 2]
-    found, notes = find_modes(data)
-    assert found.source == "stated"
-    assert found.n_modes == 1
-    assert abs(found.natural_frequency[0] - STRUCTURE.natural_frequency[0]) < (
-        4 * found.natural_frequency_std[0]
+    modes, notes = find_modes(data)
+    assert modes.source == "stated"
+    assert modes.n_modes == 1
+    assert abs(modes.natural_frequency[0] - STRUCTURE.natural_frequency[0]) < (
+        4 * modes.natural_frequency_std[0]
     )
     assert notes[0].kind == "levels_agree"
-    scaled = scale_modes(found, DrivePoint("tip"))
+    scaled = scale_modes(modes, DrivePoint("tip"))
     assert scaled.shape[0, 0] == pytest.approx(SHAPES[0, 0], rel=5e-3)
 
 
 def test_an_amplitude_dependence_is_fitted_with_both_levels():
     # Hardening with the amplitude: 2 % of the frequency for each m/s.
     own, data = STRUCTURE.natural_frequency[0], states(0.02)
-    found, notes = find_modes(data)
+    modes, notes = find_modes(data)
     (note,) = notes
     assert (note.kind, note["mode"], note["power"]) == ("amplitude_dependent_mode", 1, 1)
     assert note["levels"] == (1, 2)
     largest = np.abs(np.asarray(data.velocity)).max()
     assert note["shift_hz"] == pytest.approx(own * 0.02 * largest / HERTZ, rel=0.03)
     assert note["bandwidths"] == pytest.approx(0.02 * largest / 0.02, rel=0.03)
-    assert abs(found.natural_frequency[0] - own) < 3 * found.natural_frequency_std[0]
+    assert abs(modes.natural_frequency[0] - own) < 3 * modes.natural_frequency_std[0]
     alone = fit_linear_modes(responses_of_states(data, 1).responses)
     assert abs(alone.natural_frequency[0] - own) > 3 * alone.natural_frequency_std[0]
 
@@ -288,16 +288,16 @@ BAD = [
     ("from 1 to 3", lambda: scale_modes(FIT, DrivePoint()).linear_modes(3)),
     (
         "one scale of the shapes",
-        lambda: _asked_scale(ModesOptions(drive_point="s1", unscaled=True), None),
+        lambda: _requested_scale(ModesOptions(drive_point="s1", unscaled=True), None),
     ),
-    ("needs its kilograms", lambda: _asked_scale(ModesOptions(second_mass=0.1), None)),
-    ("only with the masses at the sensors", lambda: scale_modes(FIT, SensorMasses({}, 1.0))),
+    ("needs its mass in kg", lambda: _requested_scale(ModesOptions(second_mass=0.1), None)),
+    ("needs the masses at the sensors", lambda: scale_modes(FIT, SensorMasses({}, 1.0))),
     ("no level 7", lambda: responses_of_states(states(0.0), 7)),
 ]
 
 
-@pytest.mark.parametrize(("said", "wrong"), BAD, ids=[f"{k} {b[0]}" for k, b in enumerate(BAD)])
-def test_wrong_input_is_named(said, wrong):
-    with pytest.raises(ValueError, match=said) as error:
+@pytest.mark.parametrize(("message", "wrong"), BAD, ids=[f"{k} {b[0]}" for k, b in enumerate(BAD)])
+def test_wrong_input_is_named(message, wrong):
+    with pytest.raises(ValueError, match=message) as error:
         wrong()
     assert str(error.value).rstrip().endswith(".")

@@ -1,11 +1,11 @@
-"""Curves averaged over how much they bend, where levels differ by what nobody stated."""
+"""Curves averaged over their roughness, where levels differ by unstated errors."""
 
 import numpy as np
 import pytest
 
 from snrmjax.identify.test_model import posterior
 from snrmjax.identify.test_model import states as measured
-from snrmjax.identify.test_model.hyper import averaged, roughness_stds
+from snrmjax.identify.test_model.hyper import averaged, roughness_grid
 from snrmjax.identify.test_model.posterior import fit_test
 from snrmjax.numerics.blocks import on_one_core
 
@@ -19,7 +19,7 @@ def stiffness(a):
 
 
 def response_controlled(seed, scatter):
-    """Levels of one amplitude each, whose stiffness differs by `scatter` (1σ): nothing is solved.
+    """Levels of one amplitude each, whose stiffness differs by `scatter` (1σ), in closed form.
 
     The phase of every state is given, and (K − Ω²) = Ωδ tan φ solved for Ω.
     """
@@ -41,19 +41,19 @@ def response_controlled(seed, scatter):
 
 
 @on_one_core
-def test_bands_know_that_levels_may_differ_for_what_curves_may_bend():
+def test_bands_allow_for_both_differing_levels_and_rough_curves():
     at = np.linspace(AMPLITUDES[0], AMPLITUDES[-1], 25)
     inside = {True: [], False: []}
     for seed in range(10):
         states = response_controlled(seed, 5e-4)
-        for over_sizes, fractions in inside.items():
-            found = fit_test(states, over_sizes=over_sizes, compare_levels=False)
+        for average_roughness, fractions in inside.items():
+            found = fit_test(states, average_roughness=average_roughness, compare_levels=False)
             curves = found.curves(at)
             std = np.sqrt(curves.covariance[:, 0, 0])
             fractions.append(np.abs(curves.squared_frequency - stiffness(at)) < 1.96 * std)
-    # 95 % are meant. Ten tests of eight levels know it to some 5 %.
+    # 95 % nominal; ten tests of eight levels resolve some 5 %.
     assert np.mean(inside[True]) > 0.9
-    # The likeliest sizes alone mostly miss the lowest level, which is far from its neighbours.
+    # The most likely roughness alone mostly misses the lowest level, far from its neighbours.
     assert np.mean(inside[True], axis=0)[0] > np.mean(inside[False], axis=0)[0] + 0.3
 
 
@@ -65,18 +65,18 @@ def sampled(objective, point, bounds, draws, rng):
     crowd = np.clip(point + 0.3 * rng.normal(size=(3 * n, len(point))) * free, low, high)
     value = np.array([objective(one)[0] for one in crowd])
     kept = []
-    for turn in range(draws):
+    for step_number in range(draws):
         for k in range(len(crowd)):
-            one, other = crowd[rng.choice(len(crowd), 2, replace=False)]
-            reach = 1.0 if turn % 10 == 0 else 2.38 / np.sqrt(2 * n)
-            step = reach * (one - other) + 1e-3 * rng.normal(size=len(point))
+            first, second = crowd[rng.choice(len(crowd), 2, replace=False)]
+            reach = 1.0 if step_number % 10 == 0 else 2.38 / np.sqrt(2 * n)
+            step = reach * (first - second) + 1e-3 * rng.normal(size=len(point))
             moved = crowd[k] + step * free
             if np.any((moved < low) | (moved > high)):
                 continue
             new = objective(moved)[0]
             if np.log(rng.random()) < new - value[k]:
                 crowd[k], value[k] = moved, new
-        if turn >= draws // 3:
+        if step_number >= draws // 3:
             kept.append(crowd.copy())
     return np.concatenate(kept)
 
@@ -87,31 +87,31 @@ def sampled(objective, point, bounds, draws, rng):
 def test_bands_are_those_of_sampled_hyperparameters(monkeypatch, seed, scatter):
     given = {}
 
-    def sizes(objective, point, bounds):
+    def record_grid(objective, point, bounds):
         given["problem"] = objective, point, bounds
-        return roughness_stds(objective, point, bounds)
+        return roughness_grid(objective, point, bounds)
 
     def average(points, gaussian):
         given["gaussian"] = gaussian
         return averaged(points, gaussian)
 
-    monkeypatch.setattr(posterior, "roughness_stds", sizes)
+    monkeypatch.setattr(posterior, "roughness_grid", record_grid)
     monkeypatch.setattr(posterior, "averaged", average)
     states = response_controlled(seed, scatter)
-    found = fit_test(states, over_sizes=True, compare_levels=False)
+    found = fit_test(states, average_roughness=True, compare_levels=False)
     at = np.linspace(AMPLITUDES[0], AMPLITUDES[-1], 12)
     rng = np.random.default_rng(0)
     points = sampled(*given["problem"], 600, rng)
     means, variances = [], []
     for point in points[rng.choice(len(points), 400)]:
-        said = given["gaussian"](point)
-        curves = found._replace(mean=said.mean, covariance=said.covariance).curves(at)
+        one = given["gaussian"](point)
+        curves = found._replace(mean=one.mean, covariance=one.covariance).curves(at)
         means.append(curves.squared_frequency)
         variances.append(curves.covariance[:, 0, 0])
     std = np.sqrt(np.mean(variances, axis=0) + np.var(means, axis=0))
     curves = found.curves(at)
     assert np.max(np.abs(curves.squared_frequency - np.mean(means, axis=0)) / std) < 0.3
-    # Sizes of levels' errors are taken at their likeliest for each size of the bends.
+    # 1σ of level errors is at its mode for each roughness.
     ratio = np.sqrt(curves.covariance[:, 0, 0]) / std
     assert ratio.min() > 0.75
     assert ratio.max() < 1.3

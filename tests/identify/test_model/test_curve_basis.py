@@ -1,11 +1,11 @@
-"""Curves as sums of functions: natural cubic splines in a², whose bends have a size."""
+"""Curves as sums of functions: natural cubic splines in a² with a prior on their roughness."""
 
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, N_POWERS, CurveBasis
-from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZES_ALIKE
+from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, ROUGHNESS_LENGTH
 
 AMPLITUDE = 2e-3 * np.geomspace(0.02, 1, 60)
 
@@ -42,26 +42,28 @@ def test_slopes_are_finite_differences(basis):
     np.testing.assert_allclose(slopes, (ends[0] - ends[1]) / (2 * step), rtol=1e-5, atol=1e-6)
 
 
-def test_a_bend_is_the_distance_from_the_chord_between_its_neighbours(basis):
-    """Of knots far apart, whose mean distance in log amplitude is one unit each."""
+def test_roughness_is_the_distance_from_the_chord_between_the_neighbours(basis):
+    """For knots far apart, whose mean spacing in log amplitude is one unit each."""
     own = CurveBasis.of(np.array([0.2, 0.4, 0.8]))
     values = own.values(0.8 * np.sqrt(own.knots))[0]
     for k in range(1, len(own.knots) - 1):
         left, here, right = own.knots[k - 1 : k + 2]
         fraction = (here - left) / (right - left)
         off = values[k] - (1 - fraction) * values[k - 1] - fraction * values[k + 1]
-        # One bend moves its own knot off the chord, and no other one does.
+        # One function moves this knot off the chord, and no other.
         assert np.count_nonzero(np.abs(off[N_POWERS:]) > 1e-9) == 1
         assert np.allclose(off[:N_POWERS], 0.0, atol=1e-12)
 
 
-def test_sizes_of_bends_are_alike_over_two_of_them(basis):
+def test_roughness_is_correlated_over_two_knots(basis):
     covariance = basis.directions @ basis.directions.T
     apart = np.subtract.outer(np.arange(len(covariance)), np.arange(len(covariance)))
-    np.testing.assert_allclose(covariance, np.exp(-0.5 * (apart / SIZES_ALIKE) ** 2), atol=1e-4)
+    np.testing.assert_allclose(
+        covariance, np.exp(-0.5 * (apart / ROUGHNESS_LENGTH) ** 2), atol=1e-4
+    )
 
 
-def test_logarithms_of_variances_are_linear_in_those_of_sizes(basis):
+def test_log_variances_are_linear_in_the_log_roughness(basis):
     rng = np.random.default_rng(2)
     along = rng.normal(size=basis.directions.shape[1])
     constant, slopes = basis.log_variances()
@@ -72,13 +74,13 @@ def test_logarithms_of_variances_are_linear_in_those_of_sizes(basis):
 
 
 @pytest.mark.parametrize("amplitude", [[1.0, 1.0], [0.5, 0.51, 1.0], [1e-6, 1.0]])
-def test_few_amplitudes_are_enough(amplitude):
+def test_few_amplitudes_suffice(amplitude):
     own = CurveBasis.of(np.array(amplitude))
     assert own.n_functions == len(own.knots) >= 2
     assert np.all(np.isfinite(own.values(np.array(amplitude))[0]))
 
 
-def test_knots_crowd_where_states_do_if_asked():
+def test_crowded_knots_are_dense_where_states_cluster():
     wall = np.concatenate([np.geomspace(1e-5, 1e-3, 40), np.linspace(0.96e-3, 1e-3, 40)])
     even, crowded = (CurveBasis.of(wall, crowded=one) for one in (False, True))
     inside = [np.sqrt(basis.knots) for basis in (even, crowded)]

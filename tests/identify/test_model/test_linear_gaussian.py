@@ -51,7 +51,7 @@ def test_its_slopes_are_finite_differences(name):
     _, by_scale, by_variance = model.log_likelihood(SCALE, variance)
     at, logs = np.log(SCALE), np.log(variance)
     ends = [value(at + sign * step, logs) for sign in (1, -1)]
-    # What keeps a matrix regular (1e-12 of its diagonal) over a step of 1e-5, times its condition.
+    # Regularisation of 1e-12 of the diagonal over a step of 1e-5, times the condition number.
     assert by_scale == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
     for k, unit in enumerate(step * np.eye(len(logs))):
         ends = [value(at, logs + sign * unit) for sign in (1, -1)]
@@ -69,17 +69,17 @@ def test_a_posterior_is_that_of_regularised_least_squares(name):
 
 
 def test_wide_priors_and_small_noise_lose_no_digits():
-    """Rows that the unknowns explain but for noise of 1e-6 of them."""
+    """Rows explained by the unknowns up to relative noise of 1e-6."""
     design, true = DESIGNS["few"], np.array([1e3, -2e3, 5e2, 1e2])
     left = 1e-6 * np.random.default_rng(2).normal(size=N)
     mean, covariance = LinearRows.of(design, design @ true + left).posterior(1e-6, np.full(4, 1e12))
     flat = np.linalg.inv(design.T @ design)
     assert covariance == pytest.approx(1e-12 * flat, rel=1e-6)
-    # What keeps a matrix regular is 1e-12 of 2e3: a hundredth of the errors of 2e-7.
+    # Regularisation is 1e-12 of 2e3: a hundredth of the errors of 2e-7.
     assert mean - true == pytest.approx(flat @ design.T @ left, abs=4e-9)
 
 
-def bent(point):
+def quadratic_log_density(point):
     """ln of a normal density of two correlated numbers, and of a third that is flat."""
     matrix = np.array([[2.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 0.0]])
     step = point - np.array([0.3, -0.4, 0.0])
@@ -88,22 +88,22 @@ def bent(point):
 
 def test_what_is_normal_is_integrated_exactly():
     bounds = [(-9.0, 9.0)] * 3
-    found = maximised(bent, np.zeros(3), bounds)
+    found = maximised(quadratic_log_density, np.zeros(3), bounds)
     assert found[:2] == pytest.approx([0.3, -0.4], abs=1e-3)  # of a slope of 1e-3
     grid = np.linspace(-8, 8, 401)
-    values = [[bent(np.array([a, b, 0.0]))[0] for b in grid] for a in grid]
+    values = [[quadratic_log_density(np.array([a, b, 0.0]))[0] for b in grid] for a in grid]
     volume = np.log(trapezoid(trapezoid(np.exp(values), grid), grid))
-    # What is flat counts for the widest prior there is: 1σ of 10.
+    # A flat direction counts as a prior with 1σ of 10.
     wide = volume + np.log(10 * np.sqrt(2 * np.pi))
-    assert laplace_evidence(bent, found, bounds) == pytest.approx(wide, abs=1e-3)
-    assert laplace_evidence(bent, found, [*bounds[:2], (0.0, 0.0)]) == pytest.approx(
-        volume, abs=1e-3
-    )
+    assert laplace_evidence(quadratic_log_density, found, bounds) == pytest.approx(wide, abs=1e-3)
+    assert laplace_evidence(
+        quadratic_log_density, found, [*bounds[:2], (0.0, 0.0)]
+    ) == pytest.approx(volume, abs=1e-3)
     matrix = np.array([[2.0, 0.6], [0.6, 1.0]])
-    assert precision_at(bent, found)[:2, :2] == pytest.approx(matrix, rel=1e-4)
+    assert precision_at(quadratic_log_density, found)[:2, :2] == pytest.approx(matrix, rel=1e-4)
 
 
-def test_rows_that_are_repeated_count_once_with_their_share():
+def test_repeated_rows_count_once_with_half_the_power():
     """A likelihood to the power of a half, of rows that all stand twice, is that of one copy."""
     rng = np.random.default_rng(5)
     design, rows = rng.normal(size=(30, 4)), rng.normal(size=30)

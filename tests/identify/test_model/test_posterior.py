@@ -8,8 +8,8 @@ import pytest
 from truths.exact_states import CONSTANT, damping, squared
 
 from snrmjax.identify.test_model import states as measured
+from snrmjax.identify.test_model.gauss_newton import Rounds
 from snrmjax.identify.test_model.posterior import fit_test, levels_in_order, students_factor
-from snrmjax.identify.test_model.walk import Rounds
 from snrmjax.numerics.blocks import on_one_core
 
 LEVELS, PER_LEVEL, NOISE, SPREAD = 6, 15, 0.005, 0.005
@@ -23,7 +23,7 @@ def loss(x):
 
 
 class Made(NamedTuple):
-    """States, what made them and what was found."""
+    """States and the level errors that they were made with."""
 
     states: measured.TestStates
     stiffness: np.ndarray  # relative deviation of ω̃² of every level
@@ -34,7 +34,7 @@ class Made(NamedTuple):
 
 
 def made(seed, *, spread=SPREAD, gain=0.0, noise=NOISE, stated=True, outliers=0, tips=(2e-4, 2e-3)):
-    """Levels of states within 50° of resonance, hardening by 30 %: nothing is solved for them.
+    """Levels of states within 50° of resonance, hardening by 30 %, in closed form.
 
     The natural frequency of levels differs by `spread` (1σ, relative), their gain by `gain`.
     """
@@ -91,18 +91,18 @@ def test_curves_levels_and_noise_are_those_that_made_the_states(known, found):
     in_std, relative, band = off(found)
     assert np.abs(in_std).max() < 3
     assert np.abs(relative).max() < 0.01
-    assert band[:, 0].max() < 0.005  # half of what levels differ by: their mean is not known
+    assert band[:, 0].max() < 0.005  # half of the level scatter, whose mean is unknown
     assert band[:, 1].max() < 0.02
-    # 180 rows say the noise to 5 %.
+    # 180 rows determine the noise to 5 %.
     assert found.hyper.noise == pytest.approx(1.0, abs=0.15)
     assert np.mean(found.residuals**2) == pytest.approx(1.0, abs=0.25)
     mass, std = found.modal_mass
     assert abs(mass - 1) < 3 * std < 0.02
     assert found.differing == (False, False, True, False)
-    said = found.level_errors[:, 2]
-    # All levels but for their mean and what a smooth curve follows too: of six.
-    assert np.corrcoef(said, known.stiffness)[0, 1] > 0.99
-    assert np.std(said - known.stiffness) < 0.1 * np.std(known.stiffness)
+    estimated = found.level_errors[:, 2]
+    # Six level errors, up to their mean and what a smooth curve absorbs.
+    assert np.corrcoef(estimated, known.stiffness)[0, 1] > 0.99
+    assert np.std(estimated - known.stiffness) < 0.1 * np.std(known.stiffness)
     assert found.hyper.level_std[2] == pytest.approx(np.std(known.stiffness, ddof=1), rel=0.35)
 
 
@@ -113,13 +113,13 @@ def test_bands_hold_the_curves_of_other_tests_too(seed):
     assert np.sqrt(np.mean(in_std**2)) < 1.6
 
 
-def test_levels_that_agree_are_not_said_to_differ():
+def test_equal_levels_do_not_differ():
     found = made(3, spread=0.0).fit(compare_levels=True)
     assert found.differing == (False,) * 4
     assert off(found)[2].max() < 0.02
 
 
-def test_a_gain_of_levels_is_told_from_their_stiffness():
+def test_level_gains_are_distinguished_from_level_stiffness():
     test = made(1, spread=0.0, gain=0.03)
     found = test.fit(compare_levels=True)
     assert found.differing[0]
@@ -134,11 +134,11 @@ def test_stated_errors_of_levels_are_kept(known):
     assert not found.differing[2]  # by no more than is stated
 
 
-def test_noise_that_nobody_stated_is_found(known, found):
+def test_unstated_noise_is_estimated(known, found):
     silent = made(0, stated=False).fit()
     assert silent.hyper.noise == pytest.approx(NOISE, rel=0.15)
     both = [one.curves(AT).squared_frequency for one in (silent, found)]
-    # The size of noise that is stated is found too: the curves are the same.
+    # Relative weights are the same, so the curves agree.
     np.testing.assert_allclose(*both, rtol=2e-4)
 
 
@@ -154,22 +154,22 @@ def test_units_and_the_order_of_rows_change_nothing(known, found):
     both = found.curves(AT)
     for one, length in ((shuffled, 1.0), (scaled, 1e3)):
         curves = one.curves(length * AT)
-        # The search for sizes ends at a slope of 1e-3: curves change by far less than their band.
+        # Hyperparameters converge to a gradient of 1e-3: curves change by far less than their band.
         for name in ("squared_frequency", "modal_damping"):
             np.testing.assert_allclose(getattr(curves, name), getattr(both, name), rtol=1e-3)
         assert one.hyper.noise == pytest.approx(found.hyper.noise, rel=1e-3)
 
 
-def test_outliers_are_left_aside_on_request():
+def test_robust_noise_ignores_outliers():
     test = made(5, outliers=4)
     plain, robust = (off(test.fit(robust=one))[1] for one in (False, True))
     clean = off(made(5).fit())[1]
     assert np.abs(robust).max() < 2 * np.abs(clean).max() < np.abs(plain).max()
 
 
-def test_errors_run_with_the_forces_where_chance_does_not(known):
-    # Phases of a softening wire's seven levels (deg), fitted to states that one mode leaves
-    # correlated misfits of, and the same in another order: p = 0.002 and 0.8.
+def test_level_errors_correlated_with_force_are_detected(known):
+    # Fitted phases (deg) of a softening wire, for which one mode leaves correlated residuals, and
+    # the same in another order: p = 0.002 and 0.8.
     force = np.array([1.96, 2.45, 2.94, 3.92, 4.9, 5.88])
     states = known.states._replace(force=force[known.states.level])
     phases = np.array([2.3, 1.1, 0.3, -0.7, -1.3, -1.8])
@@ -196,7 +196,7 @@ def test_a_single_state_is_no_test(known):
         fit_test(known.states._replace(level=known.states.level[:1]))
 
 
-def test_a_force_without_a_stated_error_has_a_share_of_the_velocitys():
+def test_a_force_without_stated_error_gets_a_fraction_of_the_velocitys():
     stated = np.array([[np.nan, 0.01, 0.02], [0.003, 0.01, 0.02]])
     stated[0, 0] = 0.0
     errors, known = measured.state_errors(stated)
@@ -209,7 +209,7 @@ def test_a_force_without_a_stated_error_has_a_share_of_the_velocitys():
 
 @pytest.mark.parametrize("n_levels", [2, 3, 4, 8])
 def test_few_levels_widen_a_band_as_students_t_does(n_levels):
-    """Means of draws whose spread is found from them: 95 % of 20 000 lie inside."""
+    """Means of draws with their sample standard deviation: 95 % of 20 000 lie inside."""
     draws = np.random.default_rng(n_levels).normal(size=(20000, n_levels))
     spread = draws.std(axis=1, ddof=1)
     band = 1.96 * students_factor(n_levels - 1) * spread / np.sqrt(n_levels)
@@ -218,7 +218,7 @@ def test_few_levels_widen_a_band_as_students_t_does(n_levels):
     assert np.mean(np.abs(draws.mean(axis=1)) < band) == pytest.approx(wanted, abs=0.006)
 
 
-def test_states_that_err_alike_count_as_fewer(known, found):
+def test_states_with_correlated_residuals_count_as_fewer(known, found):
     """A slow misfit of 3 % along every level: the curves' bands must not shrink with its states."""
     slow = 0.03 * np.sin(np.tile(np.linspace(-4, 4, PER_LEVEL), LEVELS))
     states = known.states._replace(velocity=known.states.velocity * np.exp(slow), stated=False)
@@ -232,10 +232,12 @@ def test_states_that_err_alike_count_as_fewer(known, found):
     assert same == pytest.approx(1.0, abs=0.15)
 
 
-def test_a_phase_of_all_records_is_found_and_is_no_levels():
+def test_a_phase_error_of_all_records_is_no_level_error():
     clean = made(3, spread=0.0, noise=0.002)
-    turned = clean.states._replace(velocity=clean.states.velocity * np.exp(0.05j), phase_std=0.1)
-    found = fitted(turned)
+    with_phase_error = clean.states._replace(
+        velocity=clean.states.velocity * np.exp(0.05j), phase_std=0.1
+    )
+    found = fitted(with_phase_error)
     assert found.instrument_phase == pytest.approx(0.05, abs=0.004)
     assert not found.differing[1]
 
@@ -243,29 +245,29 @@ def test_a_phase_of_all_records_is_found_and_is_no_levels():
 def test_a_natural_frequency_that_moves_along_the_test_is_a_trend():
     """Frequencies and velocities times eᶜᵖ, forces times e²ᶜᵖ: K, Ω² and Ωδ of a drifting mode."""
     states = made(0, spread=0.0).states
-    place, change = np.linspace(-0.5, 0.5, len(states.level)), 0.01
-    factor = np.exp(change * place)
+    position, change = np.linspace(-0.5, 0.5, len(states.level)), 0.01
+    factor = np.exp(change * position)
     moved = states._replace(
         frequency=states.frequency * factor,
         velocity=states.velocity * factor,
         force=states.force * factor**2,
     )
     without = unasked(moved)
-    found = unasked(moved._replace(trend=place, trend_std=0.1))
+    found = unasked(moved._replace(trend=position, trend_std=0.1))
     trend, std = found.trend
     assert abs(trend - 2 * change) < 3 * std + change**2
     assert found.log_evidence > without.log_evidence + 12
-    # Of a test without drift nothing is said that was not there.
-    still, std = unasked(states._replace(trend=place, trend_std=0.1)).trend
+    # Without drift there is no trend.
+    still, std = unasked(states._replace(trend=position, trend_std=0.1)).trend
     assert abs(still) < 3 * std
     assert unasked(states).trend == (0.0, 0.0)
 
 
-def test_levels_bandwidths_apart_are_found_by_the_start_that_has_them_apart():
-    """Natural frequencies 2 % apart, where 2ζ is 1 %: the noise that is left is what was put in."""
+def test_levels_bandwidths_apart_need_the_start_that_frees_them():
+    """Natural frequencies 2 % apart, where 2ζ is 1 %: the residual noise is the true one."""
     states = made(0, spread=0.02).states
     four = Rounds(most=4)
     found = unasked(states, rounds=four._replace(levels_apart=True))
-    assert found.hyper.noise == pytest.approx(1.0, abs=0.15)  # 180 rows say it to 5 %
+    assert found.hyper.noise == pytest.approx(1.0, abs=0.15)  # 180 rows determine it to 5 %
     assert found.log_evidence >= unasked(states, rounds=four).log_evidence - 0.1
     assert found.differing == (False,) * 4

@@ -1,23 +1,23 @@
-"""Densities of sizes, against those of scipy."""
+"""Prior densities, against those of scipy."""
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from snrmjax.identify.test_model.priors import (
-    FlatSize,
-    HalfNormalSize,
+    HalfNormal,
     JointDensity,
-    LogNormalSize,
-    NormalNumber,
+    LogNormal,
+    LogUniform,
+    Normal,
 )
 
 ALL = [
-    HalfNormalSize(0.05),
+    HalfNormal(0.05),
     None,
-    LogNormalSize(0.004, 1.2),
-    NormalNumber(0.7),
-    FlatSize(-3.0, 2.0),
+    LogNormal(0.004, 1.2),
+    Normal(0.7),
+    LogUniform(-3.0, 2.0),
 ]
 
 
@@ -33,7 +33,7 @@ def log_density(point):
     )
 
 
-def test_the_density_of_all_numbers_of_a_point_is_their_product():
+def test_the_joint_density_is_the_product():
     point = np.array([np.log(0.03), 17.0, np.log(0.01), -0.4, 0.3])
     value, slopes = JointDensity.of(ALL).log_density(point)
     assert value == pytest.approx(log_density(point), rel=1e-12)

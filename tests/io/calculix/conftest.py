@@ -1,4 +1,4 @@
-"""Small decks, and programs that stand in for CalculiX where it has to fail."""
+"""Small decks, and substitute programs for failures of CalculiX."""
 
 import shutil
 
@@ -47,7 +47,7 @@ def write(tmp_path):
 
 @pytest.fixture
 def program(tmp_path):
-    """Makes a program of a few lines of shell that is called instead of CalculiX."""
+    """Create a shell script that is called instead of CalculiX."""
 
     def made(script):
         path = tmp_path / "ccx-stand-in"

@@ -21,7 +21,7 @@ def test_the_mesh_of_a_deck(write):
         deck.node_index(12)
 
 
-def test_included_files_stand_in_their_place(write):
+def test_included_files_are_inserted(write):
     nodes, rest = beam_deck().split("*ELEMENT", 1)
     write(nodes, "mesh.inp")
     deck = read_deck(write("*Include, Input=mesh.inp\n*ELEMENT" + rest))
@@ -53,7 +53,7 @@ def test_steps_without_large_displacements_are_known(write, steps, small):
     assert read_deck(write(beam_deck(steps=steps))).small_displacements is small
 
 
-def test_unknown_keywords_are_kept_as_they_stand(write):
+def test_unknown_keywords_are_kept_unchanged(write):
     deck = read_deck(
         write(beam_deck() + "*EQUATION\n2\n13, 3, 1., 11, 3, -1.\n*ORIENTATION, NAME=O\n")
     )
@@ -112,18 +112,18 @@ BAD = {
     "include missing": ("*INCLUDE, INPUT=mesh.inp\n" + GOOD, "included file mesh.inp does not"),
     "includes itself": ("*INCLUDE, INPUT=deck.inp\n" + GOOD, "deck.inp includes itself"),
     "include of nothing": ("*INCLUDE\n" + GOOD, r"\*INCLUDE needs INPUT=file"),
-    "data first": ("1, 2, 3\n" + GOOD, "'1, 2, 3' stands before the first keyword"),
+    "data first": ("1, 2, 3\n" + GOOD, "'1, 2, 3' comes before the first keyword"),
     "empty": ("", r"no \*NODE block"),
 }
 
 
-@pytest.mark.parametrize(("text", "said"), BAD.values(), ids=list(BAD))
-def test_a_deck_that_cannot_be_used_is_refused_by_line(write, text, said):
-    with pytest.raises(ValueError, match=said) as raised:
+@pytest.mark.parametrize(("text", "message"), BAD.values(), ids=list(BAD))
+def test_a_deck_that_cannot_be_used_is_refused_by_line(write, text, message):
+    with pytest.raises(ValueError, match=message) as raised:
         read_deck(write(text))
     assert "\n" not in str(raised.value)
 
 
-def test_a_deck_that_is_not_there(tmp_path):
+def test_a_missing_deck(tmp_path):
     with pytest.raises(ValueError, match="does not exist"):
         read_deck(tmp_path / "deck.inp")

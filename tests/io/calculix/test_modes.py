@@ -1,4 +1,4 @@
-"""Modes by CalculiX against beam theory, and each way in which there are none."""
+"""Modes by CalculiX against beam theory, and all failures."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_a_cantilever_of_beams_has_its_frequencies_and_shapes(write, tmp_path):
     tip = modes.deck.nearest_node((LENGTH, 0.0, 0.0))
     np.testing.assert_allclose(np.abs(modes.shape_at(tip, "z")), 2 / np.sqrt(mass), rtol=3e-3)
     np.testing.assert_allclose(modes.shape_at(tip, 1), 0.0, atol=1e-6)
-    # Translations of nodes carry all of the inertia but the rotary one of the section.
+    # Nodal translations carry all inertia except the section's rotary inertia.
     np.testing.assert_allclose(modes.carried, 1.0, atol=5e-3)
     basis = modes.basis
     np.testing.assert_allclose(basis.filter @ basis.shapes, np.eye(2), atol=1e-12)
@@ -37,11 +37,11 @@ def test_a_cantilever_of_beams_has_its_frequencies_and_shapes(write, tmp_path):
 
 @needs_calculix
 def test_reactions_of_supports_are_no_inertia(write, tmp_path):
-    # At both clamps beams have reactions, whose sum is the whole inertia with its sign turned.
+    # At both clamps beams have reactions, whose sum is minus the total inertia.
     deck = read_deck(write(beam_deck(elements=8, supports=("1, 1, 6", "17, 1, 6"))))
     masses = survey_modes(deck, 2, tmp_path / "jobs").effective_mass
     # A clamped beam's first mode has 69.0 % of the mass, its second, antisymmetric none; rows of
-    # held nodes are left out, some 0.4 % with 8 elements.
+    # fixed nodes are left out, some 0.4 % with 8 elements.
     mass = DENSITY * LENGTH * WIDTH * THICKNESS
     wanted = [[0.0, 0.0, 0.690], [0.0, 0.0, 0.0]]
     np.testing.assert_allclose(masses[:2] / mass, wanted, atol=5e-3)
@@ -80,19 +80,21 @@ def test_a_cantilever_of_shells_has_its_frequency(write, tmp_path):
     frequency = float(modes.basis.frequency[0])
     assert abs(frequency / bending_frequency(ROOTS[0], THICKNESS) - 1) < 3e-3  # as for beams
     assert abs(modes.carried[0] - 1) < 1e-3
-    # What gives way at the nodes under the nodal loads is next to nothing for shells.
+    # The local compliance under nodal loads is negligible for shells.
     assert abs(modes.residual_flexibility[0, 0]) * frequency**2 < 1e-5
 
 
 def solid_deck():
     """A clamped block of two quadratic bricks along x."""
-    places = {}
+    numbering = {}
     for i in range(5):
         for j in range(3):
             for k in range(3):
                 if (i % 2) + (j % 2) + (k % 2) <= 1:
-                    places[i, j, k] = len(places) + 1
-    nodes = [f"{n}, {0.01 * i:g}, {0.005 * j:g}, {0.005 * k:g}" for (i, j, k), n in places.items()]
+                    numbering[i, j, k] = len(numbering) + 1
+    nodes = [
+        f"{n}, {0.01 * i:g}, {0.005 * j:g}, {0.005 * k:g}" for (i, j, k), n in numbering.items()
+    ]
     corners = [
         (0, 0, 0),
         (2, 0, 0),
@@ -109,14 +111,14 @@ def solid_deck():
         tuple((a + b) // 2 for a, b in zip(corners[p], corners[q], strict=True)) for p, q in middles
     ]
     rows = [
-        f"{e + 1}, " + ", ".join(str(places[i + 2 * e, j, k]) for i, j, k in local)
+        f"{e + 1}, " + ", ".join(str(numbering[i + 2 * e, j, k]) for i, j, k in local)
         for e in range(2)
     ]
     # CalculiX takes at most 16 numbers a line.
     rows = [
         ", ".join(row.split(", ")[:11]) + ",\n" + ", ".join(row.split(", ")[11:]) for row in rows
     ]
-    fixed = [f"{n}, 1, 3" for (i, _, _), n in places.items() if i == 0]
+    fixed = [f"{n}, 1, 3" for (i, _, _), n in numbering.items() if i == 0]
     return "\n".join(
         [
             *("*NODE, NSET=ALL", *nodes, "*ELEMENT, TYPE=C3D20, ELSET=E", *rows),
@@ -139,16 +141,16 @@ def test_nodal_forces_of_solids_are_mass_times_shape(write, tmp_path):
 
 @needs_calculix
 @pytest.mark.parametrize(
-    ("text", "numbers", "said"),
+    ("text", "numbers", "message"),
     [
         (beam_deck(supports=()), (1,), "deck.inp has 6 modes without stiffness"),
-        (beam_deck(supports=("1, 1, 3",)), (1,), "mechanism or not held"),
+        (beam_deck(supports=("1, 1, 3",)), (1,), "mechanism or not supported"),
         (beam_deck(elements=2).replace("MATERIAL=STEEL,", "MATERIAL=WOOD,"), (1,), r"\*ERROR"),
     ],
     ids=["free", "hinged", "material missing"],
 )
-def test_decks_without_modes(write, tmp_path, text, numbers, said):
-    with pytest.raises(ValueError, match=said) as raised:
+def test_decks_without_modes(write, tmp_path, text, numbers, message):
+    with pytest.raises(ValueError, match=message) as raised:
         modes_of_deck(read_deck(write(text)), numbers, tmp_path / "jobs")
     assert "\n" not in str(raised.value)
 
@@ -177,7 +179,7 @@ def test_numbers_that_name_no_modes(write, tmp_path, numbers):
 
 
 @pytest.mark.parametrize(
-    ("script", "said"),
+    ("script", "message"),
     [
         ("kill -9 $$", "CalculiX gave no modes of deck.inp: killed by SIGKILL"),
         ("sleep 60", "stopped after the time limit of 0.2 s"),
@@ -187,8 +189,8 @@ def test_numbers_that_name_no_modes(write, tmp_path, numbers):
     ],
     ids=["killed", "time limit", "code", "error", "silent"],
 )
-def test_a_program_that_fails(write, tmp_path, program, script, said):
-    with pytest.raises(ValueError, match=said):
+def test_a_program_that_fails(write, tmp_path, program, script, message):
+    with pytest.raises(ValueError, match=message):
         modes_of_deck(
             read_deck(write(beam_deck())),
             (1,),

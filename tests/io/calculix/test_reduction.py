@@ -34,8 +34,8 @@ def test_a_clamped_beam_has_the_cubic_coefficient_of_the_closed_form(write):
     deck = write(beam_deck(elements=10, supports=CLAMPED))
     source = read_deck_source(deck, (1,), force=(11, "z"), sensors={"quarter": (6, "z")})
     loads = modal_loads(source.basis, 0.2 * THICKNESS)
-    found = reduced_model(source.basis, source.solve(np.asarray(loads.force)))
-    structure = source.structure(found)
+    reduced = reduced_model(source.basis, source.solve(np.asarray(loads.force)))
+    structure = source.structure(reduced)
     # von Kármán with the first mode alone: β = E A / (2 L) (∫φ'²)², where L² ∫φ'² = 12.3026 ∫φ².
     area = WIDTH * THICKNESS
     closed = YOUNG * 12.3026**2 / (2 * DENSITY**2 * area * LENGTH**5)
@@ -61,19 +61,19 @@ def test_the_command_writes_a_model_of_a_deck(write, tmp_path, capsys):
     dot = png_bytes(Figure(figsize=(1, 1)))
     with mock.patch.object(Figure, "savefig", lambda _, buffer, **__: buffer.write(dot)):
         assert command("rom", "--calculix", deck, "--modes", 1, "--no-study", "--out", out) == 0
-    said = capsys.readouterr()
-    words = " ".join((said.out + said.err).split())
+    captured = capsys.readouterr()
+    words = " ".join((captured.out + captured.err).split())
     assert "driven and observed at node 5 in z" in words
     assert "left out (*CLOAD)" in words
     assert "no step of the deck has NLGEOM" in words
-    assert "`*STEP, NLGEOM, INC=1000` in place of the deck's steps" in words
+    assert "`*STEP, NLGEOM, INC=1000` instead of the deck's steps" in words
     model = read_model(out / "model.toml")
     assert model.modes.sensors == ("node 5 z",)
     assert (out / "report.html").is_file()
 
 
 @pytest.mark.parametrize(
-    ("text", "modes", "said"),
+    ("text", "modes", "message"),
     [
         (beam_deck(), None, "`--modes` must be different mode numbers"),
         (beam_deck(), "1,1", "must be different mode numbers"),
@@ -84,13 +84,13 @@ def test_the_command_writes_a_model_of_a_deck(write, tmp_path, capsys):
     ids=["no modes", "twice", "missing node", "no CalculiX", "empty"],
 )
 def test_the_command_refuses_in_one_sentence(
-    write, tmp_path, monkeypatch, capsys, text, modes, said
+    write, tmp_path, monkeypatch, capsys, text, modes, message
 ):
     monkeypatch.setenv("PATH", str(tmp_path / "nowhere"))
     deck, out = write(text), tmp_path / "out"
     chosen = [] if modes is None else ["--modes", modes]
     assert command("rom", "--calculix", deck, *chosen, "--out", out) == 2
-    assert said in " ".join(capsys.readouterr().err.split())
+    assert message in " ".join(capsys.readouterr().err.split())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["deck.inp"]
 
 
@@ -98,5 +98,7 @@ def test_the_command_refuses_in_one_sentence(
 def test_a_mechanism_leaves_no_folder_of_jobs(write, tmp_path, capsys):
     deck, out = write(beam_deck(elements=2, supports=())), tmp_path / "out"
     assert command("rom", "--calculix", deck, "--modes", 1, "--out", out) == 2
-    assert "the structure is a mechanism or not held" in " ".join(capsys.readouterr().err.split())
+    assert "the structure is a mechanism or not supported" in " ".join(
+        capsys.readouterr().err.split()
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["deck.inp"]

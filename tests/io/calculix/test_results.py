@@ -1,4 +1,4 @@
-"""What CalculiX prints is read back number by number, and cut-off prints are seen."""
+"""Printed results of CalculiX are read exactly, and incomplete ones are refused."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_the_energy_at_the_end():
 
 def test_a_print_that_is_cut_off():
     cut = STATIC[: STATIC.index("         3  1.500000E-02")]
-    with pytest.raises(ValueError, match="displacements has 1 rows for 2 nodes: it is cut off"):
+    with pytest.raises(ValueError, match="displacements has 1 rows for 2 nodes: it is incomplete"):
         list(printed_tables(cut, NODES))
 
 

@@ -1,4 +1,4 @@
-"""Static load cases by CalculiX against beam theory; statuses and resuming without it too."""
+"""Static load cases by CalculiX against beam theory; statuses and resuming, also without it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -45,8 +45,8 @@ def test_small_loads_move_one_mode_by_its_stiffness(write, tmp_path):
     squares = np.asarray(modes.basis.frequency) ** 2
     wanted = 1e-3 * THICKNESS / np.abs(np.asarray(modes.basis.shapes)).max(axis=0)
     run = run_static_cases(modes, np.diag(squares * wanted), tmp_path / "jobs")
-    # q = f/ω² of each mode and nothing of the other, to what the printed digits resolve; what gives
-    # way under the nodal loads is 7e-4 of the sixth mode and is taken out, of the energy as well.
+    # q = f/ω² of each mode and nothing of the other, to what the printed digits resolve; the local
+    # compliance under nodal loads, 7e-4 of the sixth mode, is subtracted, also from the energy.
     np.testing.assert_allclose(run.cases.modal_displacement / wanted, np.eye(2), atol=5e-5)
     np.testing.assert_allclose(run.cases.energy, 0.5 * squares * wanted**2, rtol=1e-5)
 
@@ -88,7 +88,7 @@ def small(write):
     )
 
 
-def test_results_of_an_earlier_run_are_taken_over(small, tmp_path, program):
+def test_results_of_an_earlier_run_are_reused(small, tmp_path, program):
     (tmp_path / "printed.dat").write_text(printed(0.5, 1.0) + printed(1.0, 3.0))
     calls = tmp_path / "calls"
     stand_in = program(f"echo x >> {calls}; cp {tmp_path}/printed.dat job.dat")
@@ -135,7 +135,7 @@ def test_killed_and_unfinished_cases(small, tmp_path, program):
     whole, half = tmp_path / "whole.dat", tmp_path / "half.dat"
     whole.write_text(printed(1.0, 3.0))
     half.write_text(printed(0.5, 1.0))
-    # The load at the second node tells the cases apart.
+    # The load at the second node distinguishes the cases.
     stand_in = program(
         f"""load=$(grep -m1 '^2, 3,' job.inp)
 case "$load" in
@@ -152,19 +152,19 @@ esac"""
         assert run.status == ("killed", "diverged", "diverged", "diverged", "converged")
         assert run.errors[0] == "killed by SIGKILL"
         assert run.errors[1] == "*ERROR: too many cutbacks"
-        assert run.errors[2] == "the whole load was not reached"
-        assert "it is cut off" in run.errors[3]
+        assert run.errors[2] == "the full load was not reached"
+        assert "it is incomplete" in run.errors[3]
         assert run.cases.usable.tolist() == [False] * 4 + [True]
     assert run.found == 4  # all but the killed one, which was tried again
 
 
 @pytest.mark.parametrize(
-    ("script", "said"),
+    ("script", "message"),
     [("kill -9 $$", "killed by SIGKILL"), ("echo ' *ERROR: no such set'", r"\*ERROR: no such set")],
     ids=["killed", "refused"],
 )
-def test_not_one_case_could_be_run(small, tmp_path, program, script, said):
-    with pytest.raises(ValueError, match=f"CalculiX ran no load case of deck.inp: {said}"):
+def test_not_one_case_could_be_run(small, tmp_path, program, script, message):
+    with pytest.raises(ValueError, match=f"CalculiX ran no load case of deck.inp: {message}"):
         run_static_cases(small, [[1.0], [2.0]], tmp_path / "jobs", program=program(script))
     assert not list((tmp_path / "jobs").glob("case-*"))
 

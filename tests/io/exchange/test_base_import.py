@@ -13,7 +13,7 @@ HERTZ, G = 2 * np.pi, 9.80665
 F = np.array([30.0, 31.0, 32.0, 33.0])
 OMEGA = HERTZ * F
 ACCELERATION = np.array([0.5, 0.6, 0.5, 0.6]) * np.exp(1j * np.array([0.3, -0.2, 1.0, 2.0]))  # m/s²
-VELOCITY = np.array([0.1 - 0.1j, 0.2j, 0.3 + 0.2j, -0.1 + 0.3j])  # m/s, of the sensor itself
+VELOCITY = np.array([0.1 - 0.1j, 0.2j, 0.3 + 0.2j, -0.1 + 0.3j])  # m/s, of the sensor
 RELATIVE = VELOCITY * np.exp(-1j * np.angle(ACCELERATION))  # to the phase of the acceleration
 MOTIONS = {
     "acceleration:g": ACCELERATION / G,
@@ -24,8 +24,8 @@ MOTIONS = {
 
 
 def imported(folder, *words):
-    code, said = run_import(*words, "--out", folder / "out")
-    assert code == 0, said
+    code, output = run_import(*words, "--out", folder / "out")
+    assert code == 0, output
     return read_steady_states(folder / "out" / "measured.csv")
 
 
@@ -85,9 +85,9 @@ def test_frequency_responses_over_the_base(tmp_path, motion):
     np.testing.assert_allclose(states.force, size, rtol=1e-6)  # UFF has single steps
     np.testing.assert_allclose(np.asarray(states.velocity)[:, 0], wanted, rtol=1e-6)
     other = "velocity:m/s" if quantity == "acceleration" else "acceleration:g"
-    code, said = run_import(*words, f"0.5:{other}", "--out", tmp_path / "other")
+    code, output = run_import(*words, f"0.5:{other}", "--out", tmp_path / "other")
     assert code == 2
-    assert "which of both is right" in said
+    assert "which of both is right" in output
 
 
 @pytest.mark.parametrize("motion", ["acceleration:m/s^2", "velocity:mm/s"])
@@ -110,8 +110,8 @@ def test_a_record_of_steps_on_a_table(tmp_path, motion):
     np.testing.assert_allclose(np.asarray(states.velocity)[:, 0], RELATIVE[:3], atol=2e-6)
     turned = second * np.exp(-2j * np.angle(ACCELERATION[:3]))
     np.testing.assert_allclose(np.asarray(states.harmonics)[:, 0, 0], turned, atol=2e-6)
-    code, said = run_import(*words, "--record", "broadband", "--out", tmp_path / "record")
-    assert code == 0, said
+    code, output = run_import(*words, "--record", "broadband", "--out", tmp_path / "record")
+    assert code == 0, output
     head = (tmp_path / "record" / "record.csv").read_text().splitlines()[0]
     assert f"base_{kind}_" in head
 
@@ -122,6 +122,6 @@ def test_our_own_table_of_a_base_in_another_unit(tmp_path):
     (tmp_path / "own.csv").write_text(f"{head},velocity_re_m_s,velocity_im_m_s\n{rows}\n")
     states = imported(tmp_path, tmp_path / "own.csv", "--force-unit", "g")
     np.testing.assert_allclose(states.force, 0.1 * G, rtol=1e-14)
-    code, said = run_import(tmp_path / "own.csv", "--force-unit", "N", "--out", tmp_path / "no")
+    code, output = run_import(tmp_path / "own.csv", "--force-unit", "N", "--out", tmp_path / "no")
     assert code == 2
-    assert "must be a displacement, velocity or acceleration" in said
+    assert "must be a displacement, velocity or acceleration" in output

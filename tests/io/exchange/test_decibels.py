@@ -46,9 +46,9 @@ def test_levels_over_a_reference_are_amplitudes(tmp_path, name, values, words):
     )
     load = () if "--over-force" in words else ("--force", "F")
     size = ("--amplitude", "rms") if "rms" in name else ()
-    code, said = run_import(path, *load, "--response", *words, *size, "--out", tmp_path / "o")
-    assert code == 0, said
-    assert "is a level in dB" in said
+    code, output = run_import(path, *load, "--response", *words, *size, "--out", tmp_path / "o")
+    assert code == 0, output
+    assert "is a level in dB" in output
     root = 2**0.5 if size else 1.0  # which the force has, too
     found = velocity(tmp_path / "o")
     np.testing.assert_allclose(found[0], FORCE * root, rtol=1e-12)
@@ -76,9 +76,9 @@ def test_levels_are_never_taken_for_amplitudes(tmp_path, name, unit_row, word, c
     path = write(
         tmp_path / "a.csv", head, HERTZ, FORCE, level(SPEED, 1e-9), PHASE, unit_row=unit_row
     )
-    code, said = run_import(path, "--force", "F", "--response", word, "--out", tmp_path / "o")
+    code, output = run_import(path, "--force", "F", "--response", word, "--out", tmp_path / "o")
     assert code == 2
-    assert complaint in said
+    assert complaint in output
 
 
 @pytest.mark.parametrize("name", ["v_std", "v_dB_std", "v_std [dB]"])
@@ -86,8 +86,8 @@ def test_errors_of_levels_are_in_db(tmp_path, name):
     head = f"f [Hz],F [N],v [dB re 1 m/s],{name},phase [deg]"
     path = write(tmp_path / "a.csv", head, HERTZ, FORCE, level(SPEED), FORCE, PHASE)
     words = ("--force", "F", "--response", "v", "--amplitude-std", name, "--out", tmp_path / "o")
-    code, said = run_import(path, *words)
-    assert code == 0, said
+    code, output = run_import(path, *words)
+    assert code == 0, output
     table = np.genfromtxt(tmp_path / "o" / "measured.csv", delimiter=",", names=True)
     step = 1e-5  # of dB, a difference
     wanted = 0.5 * (SPEED * 10 ** (step / 20) - SPEED * 10 ** (-step / 20)) / (2 * step)
@@ -102,14 +102,14 @@ def test_levels_of_structs_records_and_universal_files(tmp_path):
     test = {"f": HERTZ, "F": FORCE, "v": level(SPEED), "phase": PHASE, "units": units}
     scipy.io.savemat(tmp_path / "a.mat", {"test": test})
     words = ("--force", "F", "--response")
-    code, said = run_import(tmp_path / "a.mat", *words, "v", "--out", tmp_path / "o")
-    assert code == 0, said
+    code, output = run_import(tmp_path / "a.mat", *words, "v", "--out", tmp_path / "o")
+    assert code == 0, output
     np.testing.assert_allclose(velocity(tmp_path / "o")[1], PHASOR, rtol=1e-12)
     record = {"fs": 1000.0, "v_dB": np.linspace(0, 60, 200)}
     scipy.io.savemat(tmp_path / "b.mat", record)
     decay = ("--record", "decay", "--out", tmp_path / "p")
-    code, said = run_import(tmp_path / "b.mat", "--response", "v_dB:velocity:m/s", *decay)
-    assert (code, "is a level in dB, not in m/s" in said) == (2, True)
+    code, output = run_import(tmp_path / "b.mat", "--response", "v_dB:velocity:m/s", *decay)
+    assert (code, "is a level in dB, not in m/s" in output) == (2, True)
     curve = pyuff.prepare_58(
         **{"x": HERTZ, "data": level(SPEED) + 0j, "binary": 0, "rsp_node": 1, "rsp_dir": 3},
         **{"ref_node": 1, "ref_dir": 3, "func_type": 4, "abscissa_spacing": 0},
@@ -119,6 +119,6 @@ def test_levels_of_structs_records_and_universal_files(tmp_path):
     pyuff.UFF(str(tmp_path / "c.uff")).write_sets([curve], "add")
     known = ("--force-amplitude", 1, "--out", tmp_path / "q")
     for word in ("1+z", "1+z:velocity:m/s", "1+z:velocity:dB re 1 m/s"):
-        code, said = run_import(tmp_path / "c.uff", "--response", word, *known)
-        assert code == 2, said
-        assert "level" in said
+        code, output = run_import(tmp_path / "c.uff", "--response", word, *known)
+        assert code == 2, output
+        assert "level" in output

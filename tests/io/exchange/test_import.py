@@ -1,4 +1,4 @@
-"""`snrmjax import`: raw files of laboratories to the numbers that they were made of."""
+"""`snrmjax import`: raw laboratory files give back the numbers they were made from."""
 
 from pathlib import Path
 
@@ -23,8 +23,8 @@ VELOCITY = np.array([0.1 + 0.2j, 0.3, 0.2 - 0.2j, 0.4 + 0.8j, 1.2, 0.8 - 0.8j]) 
 
 
 def imported(tmp_path, *words):
-    code, said = run(*words, "--out", tmp_path / "out")
-    assert code == 0, said
+    code, output = run(*words, "--out", tmp_path / "out")
+    assert code == 0, output
     return read_steady_states(tmp_path / "out" / "measured.csv")
 
 
@@ -37,17 +37,18 @@ def same(states, rtol):
 
 
 def amplitude_and_phase():
-    """An acceleration in g rms, with the phase that lags, as some programs have it."""
+    """An acceleration in g rms with a lagging phase, as some programs write it."""
     acceleration = VELOCITY * 1j * HERTZ * F / 9.80665 / np.sqrt(2)
     return np.abs(acceleration), -np.degrees(np.angle(acceleration))
 
 
 @pytest.fixture
 def mat(tmp_path):
-    size, phase = amplitude_and_phase()
+    amplitude, phase = amplitude_and_phase()
     kinds = [(key, object) for key in ("frequency", "force", "amplitude", "phase")]
     rows = [
-        (F[at], FORCE[at] / np.sqrt(2), size[at], phase[at]) for at in (slice(0, 3), slice(3, 6))
+        (F[at], FORCE[at] / np.sqrt(2), amplitude[at], phase[at])
+        for at in (slice(0, 3), slice(3, 6))
     ]
     path = tmp_path / "test.mat"
     scipy.io.savemat(path, {"data": np.array(rows, dtype=kinds)})
@@ -68,16 +69,16 @@ def test_a_struct_of_matlab_with_one_entry_a_level(tmp_path, mat):
 def test_the_map_takes_the_next_test(tmp_path, mat):
     imported(tmp_path, mat, *MAT)
     first = (tmp_path / "out" / "measured.csv").read_bytes()
-    told = tmp_path / "out" / "map.toml"
-    text = told.read_text()
-    assert 'level = "entry"  # assumed: the column\'s name says so' in text
-    assert read_import_map(told).level == "entry"
-    code, said = run(mat, "--map", told, "--out", tmp_path / "next")
-    assert code == 0, said
+    map_path = tmp_path / "out" / "map.toml"
+    text = map_path.read_text()
+    assert 'level = "entry"  # assumed: from the name of the column' in text
+    assert read_import_map(map_path).level == "entry"
+    code, output = run(mat, "--map", map_path, "--out", tmp_path / "next")
+    assert code == 0, output
     assert (tmp_path / "next" / "measured.csv").read_bytes() == first
-    assert read_import_map(tmp_path / "next" / "map.toml") == read_import_map(told)
-    code, said = run(mat, "--map", told, "--unit", "m/s^2", "--out", tmp_path / "other")
-    assert code == 0, said
+    assert read_import_map(tmp_path / "next" / "map.toml") == read_import_map(map_path)
+    code, output = run(mat, "--map", map_path, "--unit", "m/s^2", "--out", tmp_path / "other")
+    assert code == 0, output
     other = read_steady_states(tmp_path / "other" / "measured.csv")
     np.testing.assert_allclose(np.asarray(other.velocity)[:, 0] * 9.80665, VELOCITY, rtol=1e-14)
 
@@ -98,11 +99,11 @@ def test_responses_over_the_force_and_a_force_of_its_own_phase(tmp_path):
     path.write_text(f"f (Hz),F (N),re (m/s/N),im (m/s/N)\n{lines}\n")
     words = ("--force", "F", "--response", "re", "--over-force")
     same(imported(tmp_path, path, *words, "--imaginary", "im"), 1e-14)
-    turned = np.exp(1j * np.radians(100 + 3 * np.arange(6)))
+    rotation = np.exp(1j * np.radians(100 + 3 * np.arange(6)))
     rows = np.column_stack(
         [
-            *(F, FORCE, np.degrees(np.angle(turned)), np.abs(VELOCITY)),
-            np.degrees(np.angle(VELOCITY * turned)),
+            *(F, FORCE, np.degrees(np.angle(rotation)), np.abs(VELOCITY)),
+            np.degrees(np.angle(VELOCITY * rotation)),
         ]
     )
     lines = "\n".join(",".join(map(repr, row)) for row in rows.tolist())
@@ -112,10 +113,10 @@ def test_responses_over_the_force_and_a_force_of_its_own_phase(tmp_path):
     np.testing.assert_allclose(np.asarray(states.velocity)[:, 0], VELOCITY, rtol=0, atol=2e-15)
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.7])
-def test_complex_phasors_of_the_other_sign_are_conjugated(tmp_path, turn):
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_complex_phasors_of_the_other_sign_are_conjugated(tmp_path, angle):
     """e^(-iwt), of a force with a phase of its own: both are conjugated."""
-    phase = np.exp(1j * turn)
+    phase = np.exp(1j * angle)
     columns = {"freq": F, "F": (FORCE * phase).conj(), "v": (VELOCITY * phase).conj()}
     scipy.io.savemat(tmp_path / "test.mat", columns)
     words = ("--force", "F", "--force-unit", "N", "--response", "v:velocity:m/s")
@@ -124,12 +125,12 @@ def test_complex_phasors_of_the_other_sign_are_conjugated(tmp_path, turn):
 
 
 def sets():
-    """Spectra of force and acceleration over a generator, one set a level."""
-    found = []
+    """Spectra of force and acceleration relative to a generator signal, one set a level."""
+    spectra = []
     for at in (slice(0, 3), slice(3, 6)):
-        turn = np.exp(0.7j)  # of the amplifier
-        values = np.stack([FORCE[at] * turn, VELOCITY[at] * 1j * HERTZ * F[at] * turn])
-        found.append(
+        rotation = np.exp(0.7j)  # of the amplifier
+        values = np.stack([FORCE[at] * rotation, VELOCITY[at] * 1j * HERTZ * F[at] * rotation])
+        spectra.append(
             frequency_responses(
                 HERTZ * F[at],
                 values[:, None, :],
@@ -140,15 +141,15 @@ def sets():
                 [Channel("out", "voltage", "V", 1.0, "3", "+z")],
             )
         )
-    return found
+    return spectra
 
 
 def test_spectra_of_uff(tmp_path):
     path = tmp_path / "test.uff"
     write_uff(path, responses=sets(), levels=[1.0, 2.0])
-    code, said = run(path)
+    code, output = run(path)
     assert code == 0
-    assert "z axis 2" in said
+    assert "z axis 2" in output
     from snrmjax.io.laboratory import read_laboratory_file
 
     names = [c.name for c in read_laboratory_file(path).responses[0].responses]
@@ -182,9 +183,9 @@ def stepped(n_steps=4):
     t = np.arange(int(n_steps * dwell * rate)) / rate
     step = (t / dwell).astype(int)
     hertz = 20.0 + step
-    turn = np.cumsum(HERTZ * hertz / rate)
-    force = 2 * np.cos(turn)
-    acceleration = 0.1 * HERTZ * hertz * np.cos(turn + 0.2 + np.pi / 2)  # velocity of 0.1 m/s
+    phase = np.cumsum(HERTZ * hertz / rate)
+    force = 2 * np.cos(phase)
+    acceleration = 0.1 * HERTZ * hertz * np.cos(phase + 0.2 + np.pi / 2)  # velocity of 0.1 m/s
     return time_recording(
         np.stack([force / 50, acceleration / 98.0665]),
         [Channel("CH1", "voltage", "V"), Channel("CH2", "voltage", "V")],
@@ -208,12 +209,12 @@ def test_options_without_effect_are_refused(tmp_path):
     path = tmp_path / "steps.nc"
     write_netcdf(path, stepped())
     words = (path, "--force", "CH1", "--force-unit", "50 N", "--out", tmp_path / "out")
-    code, said = run(*words, "--response", "CH2:acceleration:10 g", "--unit", "g")
+    code, output = run(*words, "--response", "CH2:acceleration:10 g", "--unit", "g")
     assert code == 2
-    assert "--unit g is of responses whose unit is not stated" in said
-    code, said = run(*words, "--response", "CH2:acceleration:10 g", "--phase-sign", "lag")
+    assert "--unit g is for responses without a stated unit" in output
+    code, output = run(*words, "--response", "CH2:acceleration:10 g", "--phase-sign", "lag")
     assert code == 2
-    assert "--phase-sign must be left out of the time records of steps.nc" in said
+    assert "--phase-sign must be left out of the time records of steps.nc" in output
 
 
 def test_our_own_table_is_conjugated(tmp_path):
@@ -228,8 +229,8 @@ def test_a_decay_becomes_a_record(tmp_path):
     decay = np.exp(-3 * t) * np.cos(HERTZ * 40 * t)
     scipy.io.savemat(path, {"fs": 1000.0, "laser": decay})
     words = ("--response", "laser:velocity", "--unit", "mm/s", "--record", "decay")
-    code, said = run(path, *words, "--out", tmp_path / "out")
-    assert code == 0, said
+    code, output = run(path, *words, "--out", tmp_path / "out")
+    assert code == 0, output
     lines = (tmp_path / "out" / "record.csv").read_text().splitlines()
     assert lines[0] == "time_s,velocity_m_s"
     values = np.array([line.split(",") for line in lines[1:]], dtype=float)
@@ -237,7 +238,7 @@ def test_a_decay_becomes_a_record(tmp_path):
     np.testing.assert_array_equal(values[:, 1], decay * 1e-3)
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not beside the clone")
+@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not next to the clone")
 @pytest.mark.parametrize("name", ["brake_reuss_beam/force_controlled.csv"])
 def test_measured_tables_by_uff_and_by_matlab(tmp_path, name):
     states = read_steady_states(DATA / name)
@@ -292,13 +293,13 @@ def test_measured_tables_by_uff_and_by_matlab(tmp_path, name):
         "--phase-unit",
         "deg",
     )
-    for found in (back, also):
-        np.testing.assert_array_equal(found.level, level[kept])
-        np.testing.assert_array_equal(found.force, force[kept])
-        np.testing.assert_allclose(found.frequency, omega[kept], rtol=1e-15)
-        # Magnitude and degrees and back: a few roundings of the number's size.
+    for states in (back, also):
+        np.testing.assert_array_equal(states.level, level[kept])
+        np.testing.assert_array_equal(states.force, force[kept])
+        np.testing.assert_allclose(states.frequency, omega[kept], rtol=1e-15)
+        # Magnitude and degrees and back: a few roundings of the number's magnitude.
         np.testing.assert_allclose(
-            np.asarray(found.velocity)[:, 0], velocity[kept], rtol=2e-15 * 8, atol=0
+            np.asarray(states.velocity)[:, 0], velocity[kept], rtol=2e-15 * 8, atol=0
         )
 
 
@@ -308,15 +309,15 @@ LOCK_IN = (
 
 
 @pytest.mark.parametrize("asked", [(), ("--amplitude-std", "R_std", "--phase-std", "Theta_dev")])
-def test_deviations_of_a_lock_in_are_carried(tmp_path, asked):
-    """Amplitudes in mm/s rms: √2 on both; phases' errors in degrees, as the phases are."""
+def test_deviations_of_a_lock_in_are_propagated(tmp_path, asked):
+    """Amplitudes in mm/s rms: √2 on both; phase errors in degrees, as the phases."""
     (tmp_path / "log.csv").write_text(LOCK_IN)
     words = ["--force", "F", "--force-unit", "N", "--response", "R:velocity:mm/s"]
-    code, said = run(
+    code, output = run(
         *(tmp_path / "log.csv", *words, "--amplitude", "rms", *asked, "--out", tmp_path / "out")
     )
-    assert code == 0, said
-    assert ("√N" in said) == (not asked)
+    assert code == 0, output
+    assert ("√N" in output) == (not asked)
     data = read_steady_states(tmp_path / "out" / "measured.csv")
     np.testing.assert_allclose(data.velocity_std[:, 0], np.sqrt(2) * np.array([5e-4, 6e-4]))
     np.testing.assert_allclose(np.degrees(data.phase_std[:, 0]), [0.2, 0.1])
@@ -339,9 +340,9 @@ def test_deviations_of_a_lock_in_are_carried(tmp_path, asked):
 def test_deviations_that_are_none_are_refused(tmp_path, asked, row, complaint):
     (tmp_path / "log.csv").write_text(LOCK_IN + row)
     words = ["--force", "F", "--force-unit", "N", "--response", "R:velocity:mm/s", *asked]
-    code, said = run(tmp_path / "log.csv", *words, "--out", tmp_path / "out")
+    code, output = run(tmp_path / "log.csv", *words, "--out", tmp_path / "out")
     assert code == 2
-    assert complaint in said
+    assert complaint in output
 
 
 def test_responses_of_an_impact_test_point_to_modes(tmp_path):
@@ -351,25 +352,25 @@ def test_responses_of_an_impact_test_point_to_modes(tmp_path):
     values = np.ones((1, 1, 80)) * (1 + 1j * omega)
     path = tmp_path / "impact.uff"
     write_uff(path, responses=[frequency_responses(omega, values, [tip], [hammer])])
-    code, said = run(path)
+    code, output = run(path)
     assert code == 0
-    assert f"snrmjax modes {path} --drive-point SENSOR" in said
-    assert "--force-amplitude NEWTONS --response tip:1+z" in said
+    assert f"snrmjax modes {path} --drive-point SENSOR" in output
+    assert "--force-amplitude NEWTONS --response tip:1+z" in output
 
 
-def test_a_map_says_at_a_glance_what_was_assumed(tmp_path):
+def test_a_map_states_what_was_assumed(tmp_path):
     (tmp_path / "log.csv").write_text(LOCK_IN)
     words = ["--force", "F", "--force-unit", "N", "--response", "R:velocity:mm/s"]
     assert run(tmp_path / "log.csv", *words, "--out", tmp_path)[0] == 0
     lines = (tmp_path / "map.toml").read_text().splitlines()[1:]
-    said = dict(line.split("  # ", 1) for line in lines if "  # assumed: " in line)
-    assert said['amplitude = "peak"'] == "assumed: nothing is said (else rms, peak_to_peak)"
-    assert said['phase_unit = "deg"'] == "assumed: the file says so (else rad)"
-    assert "ahead of the force" in said['phase_sign = "lead"']
-    assert said['phase_sign = "lead"'].endswith("(else lag)")
-    assert said['frequency = "f"'] == "assumed: the column's name says so"
-    assert "√N" in said['amplitude_std = "R_std"']
-    assert said['sensor = "sensor 1"'].startswith("assumed: not stated")
+    comments = dict(line.split("  # ", 1) for line in lines if "  # assumed: " in line)
+    assert comments['amplitude = "peak"'] == "assumed: not stated (else rms, peak_to_peak)"
+    assert comments['phase_unit = "deg"'] == "assumed: as stated in the file (else rad)"
+    assert "leads the force" in comments['phase_sign = "lead"']
+    assert comments['phase_sign = "lead"'].endswith("(else lag)")
+    assert comments['frequency = "f"'] == "assumed: from the name of the column"
+    assert "√N" in comments['amplitude_std = "R_std"']
+    assert comments['sensor = "sensor 1"'].startswith("assumed: not stated")
     for line in lines:
         assert len(line.partition("# ")[2]) < 80, line
 
@@ -393,31 +394,31 @@ velocity_h3_re_m_s,velocity_h3_im_m_s,harmonic_std_m_s
 def test_our_own_table_in_other_units_is_restated(tmp_path, words, velocity, third, force):
     """1/(ikΩ) of order k for accelerations, ikΩ for displacements."""
     (tmp_path / "measured.csv").write_text(OWN)
-    code, said = run(tmp_path / "measured.csv", *words, "--out", tmp_path / "out")
-    assert code == 0, said
-    found = read_steady_states(tmp_path / "out" / "measured.csv")
+    code, output = run(tmp_path / "measured.csv", *words, "--out", tmp_path / "out")
+    assert code == 0, output
+    states = read_steady_states(tmp_path / "out" / "measured.csv")
     power = -1 if "g" in words else 1 if "mm" in words else 0
-    turn = np.array([49.0, 50.0]) ** power
-    np.testing.assert_allclose(found.velocity[:, 0], velocity * turn * [0.3 + 0.4j, 0.6])
-    np.testing.assert_allclose(found.velocity_std[:, 0], abs(velocity) * turn * [0.01, 0.02])
-    np.testing.assert_allclose(found.harmonics[:, 0, 0], third * turn * [0.03 + 0.06j, 0.09j])
-    np.testing.assert_allclose(found.harmonic_std[:, 0], abs(third) * turn * [0.003, 0.005])
-    np.testing.assert_allclose(found.force, np.array([2, 4]) * force)
+    factor = np.array([49.0, 50.0]) ** power
+    np.testing.assert_allclose(states.velocity[:, 0], velocity * factor * [0.3 + 0.4j, 0.6])
+    np.testing.assert_allclose(states.velocity_std[:, 0], abs(velocity) * factor * [0.01, 0.02])
+    np.testing.assert_allclose(states.harmonics[:, 0, 0], third * factor * [0.03 + 0.06j, 0.09j])
+    np.testing.assert_allclose(states.harmonic_std[:, 0], abs(third) * factor * [0.003, 0.005])
+    np.testing.assert_allclose(states.force, np.array([2, 4]) * force)
 
 
 def test_our_own_tables_force_may_be_a_voltage(tmp_path):
     (tmp_path / "measured.csv").write_text(OWN)
     words = ("--force-unit", "V", "--out", tmp_path / "out")
     assert run(tmp_path / "measured.csv", *words)[0] == 0
-    found = read_steady_states(tmp_path / "out" / "measured.csv")
-    np.testing.assert_allclose(found.drive, [2, 4])
-    assert np.isnan(found.force).all()
-    code, said = run(tmp_path / "measured.csv", "--force-unit", "g", "--out", tmp_path / "out")
+    states = read_steady_states(tmp_path / "out" / "measured.csv")
+    np.testing.assert_allclose(states.drive, [2, 4])
+    assert np.isnan(states.force).all()
+    code, output = run(tmp_path / "measured.csv", "--force-unit", "g", "--out", tmp_path / "out")
     assert code == 2
-    assert "must be a force or a voltage" in said
+    assert "must be a force or a voltage" in output
 
 
-def test_a_map_says_which_files_were_read(tmp_path):
+def test_a_map_states_which_files_were_read(tmp_path):
     (tmp_path / "our test.csv").write_text(OWN)
     out = tmp_path / "two" / "out"
     assert run(tmp_path / "our test.csv", "--out", out)[0] == 0

@@ -1,4 +1,4 @@
-"""Wrong and unclear input: exit 2, one sentence with the option that answers, nothing written."""
+"""Wrong or ambiguous input: exit 2, one sentence with the option needed, nothing written."""
 
 import gzip
 import re
@@ -13,7 +13,7 @@ from snrmjax.measure import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 
 TABLE = "f,F,v,ph\n79,0.1,1,10\n80,0.1,2,20\n81,0.1,1,200\n"
-TOLD = "--force F --force-unit N --response v:velocity:m/s"
+STATED = "--force F --force-unit N --response v:velocity:m/s"
 OVER = "--force-amplitude 1 --response a:velocity:m/s"
 
 
@@ -52,10 +52,10 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize(
     ("words", "question"),
     [
-        ("none.csv " + TOLD, "does not exist"),
-        ("t.csv.gz " + TOLD, "gzip archive: unpack"),
-        ("part.csv " + TOLD, "--frequency names it, of column_1"),
-        ("part.csv " + TOLD, "--frequency-start and --frequency-step"),
+        ("none.csv " + STATED, "does not exist"),
+        ("t.csv.gz " + STATED, "gzip archive: unpack"),
+        ("part.csv " + STATED, "--frequency names it, of column_1"),
+        ("part.csv " + STATED, "--frequency-start and --frequency-step"),
         ("t.csv --force F", "--response COLUMN:velocity"),
         ("t.csv --response v:velocity:m/s", "--force COLUMN"),
         ("t.csv --force G --response v:velocity:m/s", "has the columns f, F, v, ph"),
@@ -67,18 +67,18 @@ def folder(tmp_path_factory):
         ("t.csv --force F --force-unit N --response v:velocity:qq", "not understood"),
         ("t.csv --force F --force-unit N --response v:speed", "--response must be"),
         ("t.csv --force F --force-unit N --response w:velocity:m/s", "has the columns"),
-        ("rad.csv " + TOLD, "--phase-unit deg or rad"),
+        ("rad.csv " + STATED, "--phase-unit deg or rad"),
         ("two.csv --force v --force-unit N --response v:velocity:m/s", "--frequency names it"),
         ("sizes.csv --force F --response v", "--amplitude peak, rms"),
         ("sizes.csv --force F --response v --amplitude peak", "which is right"),
-        ("omega.csv " + TOLD, "--frequency-unit Hz or rad/s"),
-        ("negative.csv " + TOLD, "--imaginary COLUMN"),
-        ("noforce.csv " + TOLD, "must be above zero, but row 2"),
-        ("zero.csv " + TOLD, "nothing but zero"),
-        ("t.csv " + TOLD + " --level nothing", "--level must be"),
-        ("t.csv " + TOLD + " --phase-unit grad", "--phase-unit must be one of deg, rad"),
-        ("t.csv " + TOLD + " --sensor a --sensor b", "--sensor must be given once for each"),
-        ("t.csv " + TOLD + " --response v:velocity:m/s", "names 'v' twice"),
+        ("omega.csv " + STATED, "--frequency-unit Hz or rad/s"),
+        ("negative.csv " + STATED, "--imaginary COLUMN"),
+        ("noforce.csv " + STATED, "must be above zero, but row 2"),
+        ("zero.csv " + STATED, "only zero"),
+        ("t.csv " + STATED + " --level nothing", "--level must be"),
+        ("t.csv " + STATED + " --phase-unit grad", "--phase-unit must be one of deg, rad"),
+        ("t.csv " + STATED + " --sensor a --sensor b", "--sensor must be given once for each"),
+        ("t.csv " + STATED + " --response v:velocity:m/s", "names 'v' twice"),
         ("t.csv --map bad.toml", "unknown key 'forse'.*did you mean `force`"),
         ("t.csv --map worse.toml", "phase_unit"),
         ("t.csv --map no.toml", "not valid TOML"),
@@ -91,17 +91,26 @@ def folder(tmp_path_factory):
         ("frf.uff " + OVER + " --force-amplitude 1 --force-amplitude 1", "3 are stated"),
         ("frf.uff --force-amplitude -1 --response a:velocity:m/s", "must be a positive number"),
         ("frf.uff --force-amplitude z --response a:velocity:m/s", "needs positive values"),
-        ("t.csv " + TOLD + " --header-row 2", "row 2 of t.csv holds numbers"),
-        ("t.csv " + TOLD + " --record steps", "--record has no effect on a table"),
-        ("t.csv " + TOLD + " --dataset b", "names 'b', but t.csv has t"),
-        ("t.csv " + TOLD + " --force-amplitude 2", "--force-amplitude has no effect beside"),
-        ("t.csv " + TOLD + " --base v:velocity:m/s", "--force has no effect beside --base"),
-        ("t.csv " + TOLD + " --force-phase ph --over-force", "--force-phase has no effect beside"),
-        ("t.csv " + TOLD + " --imaginary ph --phase-unit deg", "--phase-unit has no effect"),
-        ("t.csv " + TOLD + " --imaginary ph --phase ph", "--phase ph has no effect"),
+        ("t.csv " + STATED + " --header-row 2", "row 2 of t.csv has numbers"),
+        ("t.csv " + STATED + " --record steps", "--record has no effect on a table"),
+        ("t.csv " + STATED + " --dataset b", "names 'b', but t.csv has t"),
+        (
+            "t.csv " + STATED + " --force-amplitude 2",
+            "--force-amplitude has no effect together with",
+        ),
+        (
+            "t.csv " + STATED + " --base v:velocity:m/s",
+            "--force has no effect together with --base",
+        ),
+        (
+            "t.csv " + STATED + " --force-phase ph --over-force",
+            "--force-phase has no effect together with",
+        ),
+        ("t.csv " + STATED + " --imaginary ph --phase-unit deg", "--phase-unit has no effect"),
+        ("t.csv " + STATED + " --imaginary ph --phase ph", "--phase ph has no effect"),
         (
             "t.csv --force v --force-unit N --response v:velocity:m/s",
-            "one column is one of the two",
+            "both as the response and as the excitation",
         ),
         (
             "t.csv --force-amplitude 2 --force-unit banana --response v:velocity:m/s",
@@ -109,24 +118,27 @@ def folder(tmp_path_factory):
         ),
         ("t.csv --force-amplitude 2 --force-unit g --response v:velocity:m/s", "--base the motion"),
         ("t.csv --force-amplitude name --response v:velocity:m/s", "must state one amplitude"),
-        ("t.csv --base F --response v:velocity:m/s", "--base must say which motion"),
+        ("t.csv --base F --response v:velocity:m/s", "--base must state its quantity"),
         ("t.csv --base -1:acceleration:g --response v:velocity:m/s", "--base must be above zero"),
         ("t.csv --base F:acceleration --response v:velocity:m/s", "--base F:acceleration:m/s"),
-        ("record.mat --base a:acceleration:g --response a:velocity:m/s", "as what drives the"),
+        (
+            "record.mat --base a:acceleration:g --response a:velocity:m/s",
+            "as the response and as the excitation",
+        ),
         ("record.mat --base 1:acceleration:g --response b:velocity:m/s", "must name the channel"),
         (
-            "record.mat " + TOLD.replace("F", "a").replace("v:", "b:") + " --decimal comma",
-            "how it is",
+            "record.mat " + STATED.replace("F", "a").replace("v:", "b:") + " --decimal comma",
+            "whose format is fixed",
         ),
     ],
 )
 def test_what_is_wrong_or_unclear_is_asked_for(tmp_path, folder, words, question, monkeypatch):
     monkeypatch.chdir(folder)
-    code, said = run(*words.split(), "--out", tmp_path / "out")
-    assert code == 2, said
-    assert "\n" not in said.strip()
+    code, output = run(*words.split(), "--out", tmp_path / "out")
+    assert code == 2, output
+    assert "\n" not in output.strip()
 
-    assert re.search(question, said), said
+    assert re.search(question, output), output
     assert list(tmp_path.iterdir()) == []
 
 
@@ -135,16 +147,16 @@ def test_what_is_wrong_or_unclear_is_asked_for(tmp_path, folder, words, question
     [
         (
             "t.csv --force F --force-unit V --over-force --response v:velocity:m/s/N",
-            "what --over-force has it over is in V, no unit of force",
-            "say so by",
+            "the divisor of --over-force is in V, which is no unit of force",
+            "give --over-force",
         ),
         (
             "t.csv --force F --force-unit N --response v --unit N",
-            "unit N is of force: give what one of its numbers is",
+            "unit N is of force: give the motion that the number 1 means",
             "--unit states",
         ),
         (
-            "t.csv --frequency-unit deg " + TOLD,
+            "t.csv --frequency-unit deg " + STATED,
             "--frequency-unit is Hz or rad/s",
             "--frequency names",
         ),
@@ -165,7 +177,7 @@ def test_what_is_wrong_or_unclear_is_asked_for(tmp_path, folder, words, question
         ),
         (
             "spectra.uff --force a --force-unit N --response b:velocity:m/s",
-            r"a of spectra.uff is over 2 references \(c, d\): .* or name a reference by --force",
+            r"a of spectra.uff has 2 references \(c, d\): .* or name a reference by --force",
             "which reference",
         ),
     ],
@@ -179,13 +191,13 @@ def test_advice_does_not_repeat_an_option_that_is_given(folder, words, answer, r
     )
     write_uff(folder / "spectra.uff", responses=[spectra])
     name, *options = words.split()
-    code, said = run(folder / name, *options, "--out", tmp_path / "out")
+    code, output = run(folder / name, *options, "--out", tmp_path / "out")
     assert code == 2
-    assert re.search(answer, said), said
-    assert repeated not in said
+    assert re.search(answer, output), output
+    assert repeated not in output
 
 
 def test_channels_without_a_folder_are_asked_for_one(folder):
-    code, said = run(folder / "t.csv", *TOLD.split())
+    code, output = run(folder / "t.csv", *STATED.split())
     assert code == 2
-    assert "--out DIR" in said
+    assert "--out DIR" in output

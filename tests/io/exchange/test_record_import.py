@@ -20,7 +20,7 @@ POUND, GRAVITY = 4.4482216152605, 9.80665
 
 
 def mobility(omega):
-    """Velocity over force of the oscillator at rest in its steady state."""
+    """Mobility of the oscillator in steady state, m/(s N)."""
     return 1j * omega / (REST**2 - omega**2 + 2j * RATIO * REST * omega)
 
 
@@ -28,7 +28,7 @@ def mobility(omega):
 def sweeps():
     """Force and acceleration of an upward sweep of 40 N and a downward one of 20 N.
 
-    Exact but for the hold of first order at 64 times the rate: (ω/12.8 kHz)²/12, some 2e-6.
+    Exact except for the first-order hold at 64 times the rate: (ω/12.8 kHz)²/12, some 2e-6.
     """
     fine = 64
     time = np.arange(round(SECONDS * RATE) * fine) / (RATE * fine)
@@ -37,8 +37,8 @@ def sweeps():
     )
     runs = []
     for first, last, force in ((8.5, 12.0, 40.0), (12.0, 8.5, 20.0)):
-        turn = HERTZ * (first * time + (last - first) / (2 * SECONDS) * time**2)
-        push = force * np.cos(turn)
+        phase = HERTZ * (first * time + (last - first) / (2 * SECONDS) * time**2)
+        push = force * np.cos(phase)
         runs.append(np.stack([push, lfilter(above.ravel(), below, push)])[:, ::fine])
     return np.concatenate(runs, axis=1)
 
@@ -79,11 +79,11 @@ def as_tdms(path, force, acceleration):
 
 def imported(path, written, *words):
     force, response, unit = written
-    told = ["--force", force, "--response", response, "--sensor", "tip", *words]
+    options = ["--force", force, "--response", response, "--sensor", "tip", *words]
     out = path.parent / "out"
-    code, said = run(path, *told, *(["--force-unit", unit] if unit else []), "--out", out)
-    assert code == 0, said
-    return read_steady_states(out / "measured.csv"), said
+    code, output = run(path, *options, *(["--force-unit", unit] if unit else []), "--out", out)
+    assert code == 0, output
+    return read_steady_states(out / "measured.csv"), output
 
 
 @pytest.mark.parametrize(
@@ -94,52 +94,54 @@ def imported(path, written, *words):
     ],
 )
 def test_slow_sweeps_become_steady_states(tmp_path, write, name):
-    """The sweep by itself shifts the peak by half its half-width: the import takes that out."""
+    """The sweep alone shifts the peak by half its half-width: the import corrects that."""
     path = tmp_path / name
-    states, said = imported(path, write(path, *sweeps()))
+    states, output = imported(path, write(path, *sweeps()))
     assert read_import_map(tmp_path / "out" / "map.toml").record == "sweep"
-    assert "2 sweeps by itself shifts the peak by up to 0.08" in " ".join(said.split())
+    assert "2 sweeps shifts the peak by up to 0.08" in " ".join(output.split())
     omega = np.asarray(states.frequency)
     near = np.abs(omega / REST - 1) < 2 * RATIO
-    found = (np.asarray(states.velocity)[:, 0] / np.asarray(states.force))[near]
+    measured_mobility = (np.asarray(states.velocity)[:, 0] / np.asarray(states.force))[near]
     assert set(np.asarray(states.level)[near]) == {1, 2}
     # Windows of 16 cycles leave 3.3e-4 at this rate, where it rings after the resonance.
-    np.testing.assert_allclose(found, mobility(omega[near]), rtol=5e-4)
-    # Taken as steady, the phasors would be off by the force that moved them: more than a tenth.
+    np.testing.assert_allclose(measured_mobility, mobility(omega[near]), rtol=5e-4)
+    # Without correction the phasors would be in error by more than a tenth.
     passed = np.asarray(states.force)[near] / np.where(np.asarray(states.level)[near] == 1, 20, 40)
     assert np.abs(passed - 1).max() > 0.1
 
 
 def steps(hertz, force, dwell=6.0):
-    """Force and acceleration of steps of so many seconds, settled from the beginning."""
-    pieces = []
+    """Force and acceleration of steps of `dwell` seconds, settled from the beginning."""
+    parts = []
     for f in hertz:
-        turn = HERTZ * f * np.arange(round(dwell * RATE)) / RATE
+        phase = HERTZ * f * np.arange(round(dwell * RATE)) / RATE
         response = force * 1j * HERTZ * f * mobility(HERTZ * f)
-        pieces.append([force * np.cos(turn), (response * np.exp(1j * turn)).real])
-    return np.concatenate(pieces, axis=1)
+        parts.append([force * np.cos(phase), (response * np.exp(1j * phase)).real])
+    return np.concatenate(parts, axis=1)
 
 
 def test_the_map_of_one_file_gives_each_of_several_files_its_own_level(tmp_path):
     hertz = np.array([9.5, 10.0, 10.5])
     paths = [tmp_path / f"{name}.mat" for name in ("low", "high")]
-    told = [as_matlab(path, *steps(hertz, f)) for path, f in zip(paths, (10.0, 25.0), strict=True)]
-    imported(paths[0], told[0])
+    options = [
+        as_matlab(path, *steps(hertz, f)) for path, f in zip(paths, (10.0, 25.0), strict=True)
+    ]
+    imported(paths[0], options[0])
     out = tmp_path / "both"
-    code, said = run(*paths, "--map", tmp_path / "out" / "map.toml", "--out", out)
-    assert code == 0, said
+    code, output = run(*paths, "--map", tmp_path / "out" / "map.toml", "--out", out)
+    assert code == 0, output
     assert read_import_map(out / "map.toml").level == "auto"
-    found = read_steady_states(out / "measured.csv")
-    np.testing.assert_array_equal(found.level, [1, 1, 1, 2, 2, 2])
-    np.testing.assert_allclose(found.force, np.repeat([10.0, 25.0], 3), rtol=1e-5)
+    states = read_steady_states(out / "measured.csv")
+    np.testing.assert_array_equal(states.level, [1, 1, 1, 2, 2, 2])
+    np.testing.assert_allclose(states.force, np.repeat([10.0, 25.0], 3), rtol=1e-5)
 
 
 def test_steps_of_a_tdms_file(tmp_path):
-    """Ten steps at two forces, settled from the beginning: whatever is off is the reading's."""
+    """Ten steps at two forces, settled from the beginning: any error is that of the import."""
     path = tmp_path / "steps.tdms"
     hertz = np.array([9.5, 9.8, 10.0, 10.2, 10.5])
-    pieces = np.concatenate([steps(hertz, force) for force in (10.0, 25.0)], axis=1)
-    states, _ = imported(path, as_tdms(path, *pieces))
+    parts = np.concatenate([steps(hertz, force) for force in (10.0, 25.0)], axis=1)
+    states, _ = imported(path, as_tdms(path, *parts))
     assert read_import_map(tmp_path / "out" / "map.toml").record == "steps"
     np.testing.assert_array_equal(states.level, np.repeat([1, 2], 5))
     np.testing.assert_allclose(states.frequency, np.tile(hertz, 2) * HERTZ, rtol=1e-6)

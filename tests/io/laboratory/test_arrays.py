@@ -1,4 +1,4 @@
-"""MATLAB, HDF5 and netCDF files by scipy, h5py and xarray: what their structs hold."""
+"""MATLAB, HDF5 and netCDF files written by scipy, h5py and xarray."""
 
 import struct
 import zlib
@@ -26,7 +26,7 @@ def level(k):
 
 
 def write_v73(path, fill):
-    """A file as MATLAB v7.3 lays it out: 512 bytes of user block, then HDF5."""
+    """A file in the layout of MATLAB v7.3: a user block of 512 bytes, then HDF5."""
     with h5py.File(path, "w", userblock_size=512) as file:
         fill(file)
     with open(path, "r+b") as raw:
@@ -77,9 +77,9 @@ def test_one_list_entry_a_level(tmp_path, version):
         scipy.io.savemat(path, {"data": data}, do_compression="comp" in version)
     else:
         write_v73(path, lambda file: (cells if "cells" in version else struct_array)(file, structs))
-    found = read_laboratory_file(path)
-    assert found.kind == "matlab"
-    (table,) = found.tables
+    contents = read_laboratory_file(path)
+    assert contents.kind == "matlab"
+    (table,) = contents.tables
     assert table.name == "data"
     np.testing.assert_array_equal(table.columns["entry"], [1, 1, 1, 2, 2, 2])
     np.testing.assert_array_equal(table.columns["frequency"], [*(HERTZ + 1), *(HERTZ + 2)])
@@ -113,11 +113,11 @@ def test_complex_columns_and_matrices_of_responses(tmp_path):
     path = tmp_path / "frf.mat"
     h = np.arange(6).reshape(2, 3) * (1 + 1j)
     scipy.io.savemat(path, {"f": HERTZ, "H": h, "H1": h[0]})
-    found = read_laboratory_file(path)
-    (one,) = found.responses
+    contents = read_laboratory_file(path)
+    (one,) = contents.responses
     np.testing.assert_array_equal(one.values[:, 0], h)
     np.testing.assert_array_equal(one.frequency, HERTZ * 2 * np.pi)
-    np.testing.assert_array_equal(found.tables[0].columns["H1"], h[0])
+    np.testing.assert_array_equal(contents.tables[0].columns["H1"], h[0])
 
 
 @pytest.mark.parametrize("version", ["v5", "v7.3", "hdf5", "netcdf"])
@@ -155,8 +155,8 @@ def test_a_time_record_with_a_table_of_steps(tmp_path, version):
         xarray.Dataset({**records, **steps}, coords={"time": time}).to_netcdf(
             path, engine="h5netcdf"
         )
-    found = read_laboratory_file(path)
-    (record,) = found.recordings
+    contents = read_laboratory_file(path)
+    (record,) = contents.recordings
     assert record.channel_names == ("F", "acc")
     assert record.sampling_rate == 2048
     assert record.start_time == (0.0 if version == "hdf5" else 0.25)
@@ -166,7 +166,7 @@ def test_a_time_record_with_a_table_of_steps(tmp_path, version):
     assert record.channels[0].quantity == {"hdf5": "acceleration", "netcdf": "force"}.get(
         version, "unknown"
     )
-    (table,) = found.tables
+    (table,) = contents.tables
     np.testing.assert_array_equal(table.columns["frequency"], HERTZ)
 
 
@@ -184,10 +184,10 @@ def test_an_uneven_time_is_a_column(tmp_path):
     path = tmp_path / "uneven.mat"
     time = np.cumsum(1 + 0.01 * np.random.default_rng(0).normal(size=100))
     scipy.io.savemat(path, {"t": time, "x": time})
-    found = read_laboratory_file(path)
-    assert not found.recordings
-    assert found.notes[0].kind == "uneven_time"
-    assert set(found.tables[0].columns) == {"t", "x"}
+    contents = read_laboratory_file(path)
+    assert not contents.recordings
+    assert contents.notes[0].kind == "uneven_time"
+    assert set(contents.tables[0].columns) == {"t", "x"}
 
 
 def test_function_handles_and_objects_are_named(tmp_path):
@@ -200,10 +200,10 @@ def test_function_handles_and_objects_are_named(tmp_path):
         one.attrs["MATLAB_object_decode"] = 3
 
     write_v73(path, fill)
-    found = read_laboratory_file(path)
-    named = [(note["name"], note["kind"]) for note in found.notes]
+    contents = read_laboratory_file(path)
+    named = [(note["name"], note["kind"]) for note in contents.notes]
     assert named == [("f", "function_handle"), ("s", "string")]
-    assert set(found.tables[0].columns) == {"x"}
+    assert set(contents.tables[0].columns) == {"x"}
 
 
 def object_of_matlab(name, kind):
@@ -222,7 +222,7 @@ def object_of_matlab(name, kind):
 
 @pytest.mark.parametrize("is_compressed", [False, True])
 @pytest.mark.parametrize("kinds", [("table",), ("string", "datetime", "containers.Map")])
-def test_objects_beside_plain_arrays_are_named(tmp_path, kinds, is_compressed):
+def test_objects_next_to_plain_arrays_are_named(tmp_path, kinds, is_compressed):
     path = tmp_path / "objects.mat"
     scipy.io.savemat(path, {"frequency": HERTZ, "s": {"force": 1.0}}, do_compression=is_compressed)
     for kind in kinds:
@@ -231,9 +231,9 @@ def test_objects_beside_plain_arrays_are_named(tmp_path, kinds, is_compressed):
             packed = zlib.compress(packed)
             packed = struct.pack("<II", 15, len(packed)) + packed
         path.write_bytes(path.read_bytes() + packed)
-    found = read_laboratory_file(path)
-    np.testing.assert_array_equal(found.tables[0].columns["frequency"], HERTZ)
-    named = [(note["name"], note["kind"]) for note in found.notes]
+    contents = read_laboratory_file(path)
+    np.testing.assert_array_equal(contents.tables[0].columns["frequency"], HERTZ)
+    named = [(note["name"], note["kind"]) for note in contents.notes]
     assert named == [(f"a_{kind[:3]}", kind) for kind in kinds]
     path.write_bytes(path.read_bytes()[:128] + object_of_matlab("T", "timetable"))
     with pytest.raises(ValueError, match=r"could be read: T is of the class timetable"):
@@ -264,15 +264,15 @@ def test_more_numbers_than_the_file_can_hold(tmp_path):
         read_laboratory_file(path)
 
 
-def test_texts_behind_a_user_block(tmp_path):
+def test_texts_after_a_user_block(tmp_path):
     path = tmp_path / "texts.h5"
     words = ["load cell", "", "µm/s", "x" * 3000]
     with h5py.File(path, "w", userblock_size=1024) as file:
         file.create_dataset("channels", data=words, dtype=h5py.string_dtype())
         file.create_dataset("values", data=np.arange(400.0).reshape(4, 100))
         file.attrs["fs"] = 100.0
-    found = read_laboratory_file(path)
-    assert list(found.recordings[0].channel_names) == [words[0], "values_2", *words[2:]]
+    contents = read_laboratory_file(path)
+    assert list(contents.recordings[0].channel_names) == [words[0], "values_2", *words[2:]]
 
 
 def v4_matrix(name, values, order, kind, code, imaginary=None):
@@ -308,15 +308,15 @@ def test_level_4_of_both_orders_of_bytes(tmp_path):
         read_laboratory_file(path)
 
 
-def test_texts_alone_are_said_to_be_all(tmp_path):
+def test_a_file_of_texts_alone_is_refused(tmp_path):
     path = tmp_path / "words.mat"
     scipy.io.savemat(path, {"title": "beam", "n": 3.0, "none": np.zeros((0, 2))})
-    with pytest.raises(ValueError, match=r"only texts, single numbers and empty arrays \(title, n"):
+    with pytest.raises(ValueError, match=r"only text, single numbers and empty arrays \(title, n"):
         read_laboratory_file(path)
 
 
 def test_blanks_without_their_bytes(tmp_path):
-    """A text of one blank as MATLAB may write it: a side of 1, and no byte."""
+    """A text of one blank as MATLAB may write it: a dimension of 1, and no byte."""
     path = tmp_path / "blank.mat"
     scipy.io.savemat(path, {"note": "q", "frequency": HERTZ}, format="5")
     content = bytearray(path.read_bytes())
@@ -329,7 +329,7 @@ def test_blanks_without_their_bytes(tmp_path):
 
 
 def test_elements_of_no_type_are_refused(tmp_path):
-    """Zeros where an element begins: within scipy they end the process."""
+    """Zeros at the start of an element crash scipy."""
     path = tmp_path / "zeros.mat"
     scipy.io.savemat(path, {"frequency": HERTZ, "H": HERTZ + 1j})
     content = bytearray(path.read_bytes())
@@ -458,9 +458,9 @@ a tip
 def test_the_text_format_of_octave(tmp_path):
     path = tmp_path / "a.mat"
     path.write_text(OCTAVE)
-    found = read_laboratory_file(path)
-    assert found.kind == "octave"
-    named = {table.name: table for table in found.tables}
+    contents = read_laboratory_file(path)
+    assert contents.kind == "octave"
+    named = {table.name: table for table in contents.tables}
     columns = named["test"].columns
     np.testing.assert_array_equal(columns["frequency"], HERTZ)
     np.testing.assert_array_equal(columns["force"], [1, 2, 4])
@@ -469,9 +469,9 @@ def test_the_text_format_of_octave(tmp_path):
     levels = named["levels"].columns
     assert levels["force"].tolist() == [0.1, 0.1, 0.2, 0.2]
     assert levels["frequency"].tolist() == [10, 11, 10, 12]
-    said = [(note.kind, note["name"]) for note in found.notes]
-    assert ("object_not_read", "test.f") in said
-    assert ("not_read", "S") in said
+    notes = [(note.kind, note["name"]) for note in contents.notes]
+    assert ("object_not_read", "test.f") in notes
+    assert ("not_read", "S") in notes
 
 
 @pytest.mark.parametrize(
@@ -489,7 +489,7 @@ def test_the_text_format_of_octave(tmp_path):
 def test_damaged_text_of_octave_is_refused(tmp_path, old, new, complaint):
     path = tmp_path / "a.mat"
     path.write_text(OCTAVE.replace(old, new))
-    with pytest.raises(ValueError, match=rf"a\.mat is (cut|damaged): .*{complaint}"):
+    with pytest.raises(ValueError, match=rf"a\.mat is (truncated|damaged): .*{complaint}"):
         read_laboratory_file(path)
 
 
@@ -512,48 +512,48 @@ def test_a_start_and_a_step_are_the_axis_of_responses(tmp_path, version, names, 
                 put(file, key, np.atleast_2d(value))
 
         write_v73(path, fill)
-    found = read_laboratory_file(path)
-    (one,) = found.responses
+    contents = read_laboratory_file(path)
+    (one,) = contents.responses
     np.testing.assert_allclose(one.frequency, 2 * np.pi * (10 + 0.25 * np.arange(20)), rtol=1e-13)
     np.testing.assert_array_equal(one.values[:, 0], h[:1] if is_vector else h)
-    assert not found.tables
-    assert [note.kind for note in found.notes if note.kind != "responses_along_first_side"] == [
+    assert not contents.tables
+    assert [note.kind for note in contents.notes if note.kind != "responses_along_first_side"] == [
         *("even_axis", "not_read")
     ]
-    assert any(note.get("why") == "marks" for note in found.notes)
+    assert any(note.get("why") == "marks" for note in contents.notes)
 
 
-def test_an_axis_that_is_stated_and_marks_beside_responses(tmp_path):
+def test_a_stated_axis_and_marks_with_responses(tmp_path):
     path, out = tmp_path / "frf.mat", tmp_path / "out"
     h, valid = np.arange(1, 41).reshape(2, 20) * (1 + 2j), np.arange(20) > 3
     scipy.io.savemat(path, {"H": h, "valid": valid})
-    code, said = run_import(path)
+    code, output = run_import(path)
     assert code == 0
-    assert "snrmjax import" in said
-    assert "--frequency-start HZ --frequency-step HZ" in said
+    assert "snrmjax import" in output
+    assert "--frequency-start HZ --frequency-step HZ" in output
     words = ("--response", "H.2:velocity:m/s", "--force-amplitude", 2, "--out", out)
     axis = ("--frequency-start", 10, "--frequency-step", 0.25)
-    code, said = run_import(path, *axis, *words)
-    assert code == 0, said
+    code, output = run_import(path, *axis, *words)
+    assert code == 0, output
     table = np.genfromtxt(out / "measured.csv", delimiter=",", names=True)
     np.testing.assert_allclose(table["frequency_hz"], 10 + 0.25 * np.arange(20), rtol=1e-13)
     np.testing.assert_allclose(table["velocity_im_m_s"], 2 * h[1].imag, rtol=1e-13)
-    # The map of that import reads the next file alike.
-    code, said = run_import(path, "--map", out / "map.toml", "--out", tmp_path / "again")
+    # The map of that import reads the next file the same way.
+    code, output = run_import(path, "--map", out / "map.toml", "--out", tmp_path / "again")
     assert (tmp_path / "again" / "measured.csv").read_text() == (out / "measured.csv").read_text()
     assert "needs --frequency-step" in run_import(path, *axis[:2], *words)[1]
     scipy.io.savemat(path, {"H": h, "f": 10 + np.arange(20), "valid": valid})
     assert "--frequency-step has no effect" in run_import(path, *axis, *words)[1]
-    found = read_laboratory_file(path)
-    assert not found.tables
-    assert len(found.responses) == 1
-    # A truth value is never proposed as the response of a table.
+    contents = read_laboratory_file(path)
+    assert not contents.tables
+    assert len(contents.responses) == 1
+    # A boolean column is never proposed as the response of a table.
     scipy.io.savemat(path, {"f": 10 + np.arange(20), "good": valid, "v": h[0].real})
     assert "--response v:" in run_import(path)[1]
 
 
 def test_an_array_without_its_imaginary_part_is_refused(tmp_path):
-    """A damaged flag says that a field is complex: within scipy it ends the process."""
+    """A damaged flag marks a field as complex, which crashes scipy."""
     path = tmp_path / "flag.mat"
     scipy.io.savemat(path, {"s": {"frequency": HERTZ, "v": HERTZ**2}})
     content = bytearray(path.read_bytes())
@@ -565,7 +565,7 @@ def test_an_array_without_its_imaginary_part_is_refused(tmp_path):
 
 
 def test_a_heap_of_texts_without_an_end_is_refused(tmp_path):
-    """Zeros over the size of its free space: within HDF5 reading a text never ends."""
+    """With a zero size of its free space, reading a text within HDF5 never ends."""
     path = tmp_path / "heap.h5"
     with h5py.File(path, "w") as file:
         file["x"] = HERTZ
@@ -579,13 +579,13 @@ def test_a_heap_of_texts_without_an_end_is_refused(tmp_path):
         at += 16 + -(-int.from_bytes(content[at + 8 : at + 16], "little") // 8) * 8
     content[at : at + 16] = bytes(16)
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"heap\.h5 is damaged .*heap of texts without an end"):
+    with pytest.raises(ValueError, match=r"heap\.h5 is damaged .*global heap without an end"):
         read_laboratory_file(path)
 
 
 @pytest.mark.parametrize("chunks", [None, (1,)])
 def test_a_text_longer_than_its_file_is_refused(tmp_path, chunks):
-    """The library of HDF5 takes the memory that a text of varying length states."""
+    """The HDF5 library allocates the declared length of a variable-length string."""
     path = tmp_path / "long.h5"
     with h5py.File(path, "w", userblock_size=512) as file:
         file["x"] = HERTZ
@@ -598,5 +598,7 @@ def test_a_text_longer_than_its_file_is_refused(tmp_path, chunks):
     at = content.index(struct.pack("<IQ", 5, heap))
     content[at : at + 4] = struct.pack("<I", 2**26)
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=rf"long\.h5 is damaged .*names has a text of {2**26} let"):
+    with pytest.raises(
+        ValueError, match=rf"long\.h5 is damaged .*names has a string of {2**26} cha"
+    ):
         read_laboratory_file(path)

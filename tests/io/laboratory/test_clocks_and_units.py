@@ -1,4 +1,4 @@
-"""Channels on clocks of their own, responses over forces in many units, proposals that run."""
+"""Channels on separate clocks, responses per force in many units, proposed commands that run."""
 
 import shlex
 
@@ -44,19 +44,19 @@ def at(milliseconds):
     ],
 )
 def test_channels_are_shifted_by_the_starts_that_they_state(tmp_path, channels, first, count):
-    found = tdms(tmp_path / "a.tdms", *channels)
-    (record,) = found.recordings
+    contents = tdms(tmp_path / "a.tdms", *channels)
+    (record,) = contents.recordings
     assert record.n_samples == count
     for k, values in enumerate(record.values()):
         np.testing.assert_array_equal(values, (k + 1) * WAVE[first : first + count])
-    moved = len({one[0] for one in channels}) > 1
-    assert ("earlier" in " ".join(map(str, found.notes))) == moved
+    is_shifted = len({one[0] for one in channels}) > 1
+    assert ("earlier" in " ".join(map(str, contents.notes))) == is_shifted
 
 
 @pytest.mark.parametrize("late", [at(5.4), at(300), {"wf_increment": 1.5 / RATE}])
 def test_channels_that_share_no_instants_stay_apart(tmp_path, late):
-    found = tdms(tmp_path / "a.tdms", (0, N, at(0)), (0, N, late))
-    assert len(found.recordings) == 2
+    contents = tdms(tmp_path / "a.tdms", (0, N, at(0)), (0, N, late))
+    assert len(contents.recordings) == 2
 
 
 RATIOS = {
@@ -71,22 +71,22 @@ RATIOS = {
 
 
 @pytest.mark.parametrize("label", RATIOS)
-def test_a_motion_over_a_force_says_both(tmp_path, label):
-    """Written by pyuff; its label is all that is stated."""
+def test_a_motion_per_force_has_both_units(tmp_path, label):
+    """Written by pyuff; only its label states the units."""
     hertz = np.linspace(79, 81, 9)
     values = (1 + 0.2j) * np.linspace(1, 2, 9)
-    place = {"rsp_node": 1, "rsp_dir": 3, "ref_node": 1, "ref_dir": 3}
+    nodes = {"rsp_node": 1, "rsp_dir": 3, "ref_node": 1, "ref_dir": 3}
     kind = {"func_type": 4, "abscissa_spacing": 0, "abscissa_spec_data_type": 18}
     kind |= {"ordinate_spec_data_type": 0, "orddenom_spec_data_type": 0}
     kind |= {"ordinate_axis_units_lab": label}
-    one = pyuff.prepare_58(x=hertz, data=values, binary=0, **place, **kind)
+    one = pyuff.prepare_58(x=hertz, data=values, binary=0, **nodes, **kind)
     pyuff.UFF(str(tmp_path / "a.uff")).write_sets([one], "add")
     (sets,) = read_laboratory_file(tmp_path / "a.uff").responses
     assert sets.references[0].quantity == "force"
     np.testing.assert_allclose(sets.values[0, 0], RATIOS[label] * values, rtol=1e-11)
     words = ["--force-amplitude", "2", "--response", "1+z", "--out", tmp_path / "out"]
-    code, said = run_import(tmp_path / "a.uff", *words)
-    assert code == 0, said
+    code, output = run_import(tmp_path / "a.uff", *words)
+    assert code == 0, output
     states = read_steady_states(tmp_path / "out" / "measured.csv")
     order = {"acceleration": 2, "velocity": 1, "displacement": 0}[sets.responses[0].quantity]
     wanted = 2 * RATIOS[label] * values * (2j * np.pi * hertz) ** (1 - order)
@@ -102,7 +102,7 @@ def written(folder, kind):
     path = folder / f"a.{kind}"
     rows = [F, np.full(4, 0.7), np.array([3.0, 9.0, 20.0, 8.0]), PHASE]
     wanted = rows[2] * np.exp(1j * PHASE) / (2j * np.pi * F)
-    if kind == "mat":  # units in a list beside the columns
+    if kind == "mat":  # units in a list
         names = ["frequency", "force", "amplitude", "phase"]
         units = np.array(["Hz", "N", "m/s^2", "rad"], dtype=object)
         scipy.io.savemat(path, {"FR": dict(zip(names, rows, strict=True)) | {"units": units}})
@@ -110,7 +110,7 @@ def written(folder, kind):
     heads = {
         "csv": "Drive freq [Hz],Load cell [N],Pt 3 [m/s²],Angle [rad]",
         "txt": "Drive freq;Load cell;Pt 3;Angle\nHz;N;m/s^2;rad",
-        "dat": "f\tF (N)\ta (m/s^2)\ttheta",  # radians by their size alone
+        "dat": "f\tF (N)\ta (m/s^2)\ttheta",  # radians by their magnitude alone
         "asc": "# f[HZ]  F[N]  a[m/s2]  ph[RAD]",
     }
     by = {"csv": ",", "txt": ";", "dat": "\t", "asc": "  "}[kind]
@@ -126,8 +126,8 @@ def test_the_command_that_is_proposed_runs_and_is_right(tmp_path, kind):
     assert code == 0
     (line,) = [line for line in listed.splitlines() if line.startswith("  snrmjax import")]
     words = shlex.split(line)[2:]
-    code, said = run_import(*words[: words.index("--out")], "--out", tmp_path / "out")
-    assert code == 0, said
+    code, output = run_import(*words[: words.index("--out")], "--out", tmp_path / "out")
+    assert code == 0, output
     states = read_steady_states(tmp_path / "out" / "measured.csv")
     np.testing.assert_allclose(np.asarray(states.velocity)[:, 0], wanted, rtol=1e-12)
     np.testing.assert_allclose(states.force, 0.7)

@@ -1,4 +1,4 @@
-"""Names that have their units in them: the command that is proposed reads the numbers as meant."""
+"""Names with units in them: the proposed command reads the numbers correctly."""
 
 import shlex
 
@@ -33,8 +33,8 @@ def proposed(path, out):
     assert "import it (check the names):" in listed, listed
     assert "it will ask" not in listed, listed
     words = shlex.split(line)[2:-2]
-    code, said = run_import(*words, "--out", out)
-    assert code == 0, said
+    code, output = run_import(*words, "--out", out)
+    assert code == 0, output
     return read_steady_states(out / "measured.csv"), words
 
 
@@ -45,7 +45,7 @@ def same(states):
 
 
 G, RAD, POUND, INCH = 9.80665, np.pi / 180, 4.4482216152605, 0.0254
-# Names, the motion, and how many of the units of the columns one Hz, N, SI unit and degree has.
+# Names, the motion, and the factors from Hz, N, SI and degrees to the columns' units.
 TABLES = [
     ("Hz;N;mm/s;deg", "velocity", (1, 1, 1e3, 1)),
     ("Hz;N;m/s²;°", "acceleration", (1, 1, 1, 1)),
@@ -74,9 +74,9 @@ def test_the_proposed_command_reads_units_in_names(tmp_path, names, motion, unit
     written(tmp_path / "sweep.csv", names, motion, units)
     states, words = proposed(tmp_path / "sweep.csv", tmp_path / "out")
     same(states)
-    size = "rms" if "rms" in names or "eff." in names else "peak_to_peak" if "pp" in names else ""
-    assert ("--amplitude" in words) == bool(size)
-    assert not size or words[words.index("--amplitude") + 1] == size
+    kind = "rms" if "rms" in names or "eff." in names else "peak_to_peak" if "pp" in names else ""
+    assert ("--amplitude" in words) == bool(kind)
+    assert not kind or words[words.index("--amplitude") + 1] == kind
 
 
 def test_names_as_the_file_has_them_are_taken(tmp_path):
@@ -87,11 +87,11 @@ def test_names_as_the_file_has_them_are_taken(tmp_path):
     for option, name in zip(("frequency", "force", "response", "phase"), columns, strict=True):
         words += [f"--{option}", name]
     out = tmp_path / "out"
-    code, said = run_import(tmp_path / "sweep.csv", *words, "--out", out)
-    assert code == 0, said
-    assert "rms: by the names of the columns" in said
+    code, output = run_import(tmp_path / "sweep.csv", *words, "--out", out)
+    assert code == 0, output
+    assert "rms: from the names of the columns" in output
     same(read_steady_states(out / "measured.csv"))
-    words[5] += ":velocity:m/s"  # what is stated wins over the file
+    words[5] += ":velocity:m/s"  # stated options take precedence over the file
     words += ["--amplitude", "peak"]
     assert run_import(tmp_path / "sweep.csv", *words, "--out", out)[0] == 0
     velocity = np.asarray(read_steady_states(out / "measured.csv").velocity)[:, 0]
@@ -99,7 +99,7 @@ def test_names_as_the_file_has_them_are_taken(tmp_path):
 
 
 @pytest.mark.parametrize("response", ["F [m/s]", "F"])
-def test_names_that_differ_in_their_units_alone_are_told_apart(tmp_path, response):
+def test_names_that_differ_only_in_their_units_are_distinguished(tmp_path, response):
     written(tmp_path / "sweep.csv", f"f [Hz];F [N];{response};phi [deg]")
     words = [
         "--force",
@@ -109,34 +109,34 @@ def test_names_that_differ_in_their_units_alone_are_told_apart(tmp_path, respons
         "--out",
         tmp_path / "out",
     ]
-    code, said = run_import(tmp_path / "sweep.csv", *words)
-    assert code == 0, said
+    code, output = run_import(tmp_path / "sweep.csv", *words)
+    assert code == 0, output
     same(read_steady_states(tmp_path / "out" / "measured.csv"))
 
 
 def test_a_name_with_a_colon_is_taken(tmp_path):
     written(tmp_path / "sweep.csv", "f_Hz;Out:Force;In:velocity;phase_deg")
     words = ["--force", "Out:Force", "--force-unit", "N", "--response", "In:velocity"]
-    code, said = run_import(
+    code, output = run_import(
         tmp_path / "sweep.csv", *words, "--unit", "m/s", "--out", tmp_path / "o"
     )
-    assert code == 0, said
+    assert code == 0, output
     same(read_steady_states(tmp_path / "o" / "measured.csv"))
 
 
-def test_one_column_rms_and_another_of_unknown_size_are_asked_about(tmp_path):
+def test_one_column_rms_and_another_of_unknown_kind_are_asked_about(tmp_path):
     written(tmp_path / "sweep.csv", "f_Hz;Kraft eff. (N);v_mm_s;phase_deg")
     code, listed = run_import(tmp_path / "sweep.csv")
     assert code == 0
-    assert "it will ask: names and units say rms of some columns and not of others" in listed
+    assert "it will ask: names and units state rms for some columns but not for others" in listed
 
 
-TWO_READINGS = """m,g,s,A,V,in,min,ref_m,left_g,x_max_in,x_grad,v_rad,ch1_N,acc_mV,acc_mm_s,vel_ms,
+AMBIGUOUS = """m,g,s,A,V,in,min,ref_m,left_g,x_max_in,x_grad,v_rad,ch1_N,acc_mV,acc_mm_s,vel_ms,
 f_n,torque_N_mm,torque_Nm,level 2 N,tip 10 g,ref_point"""
 
 
-@pytest.mark.parametrize("name", TWO_READINGS.replace("\n", "").split(","))
-def test_an_ending_of_two_readings_is_no_unit(name):
+@pytest.mark.parametrize("name", AMBIGUOUS.replace("\n", "").split(","))
+def test_an_ambiguous_ending_is_no_unit(name):
     assert label_of(name).unit == ""
 
 
@@ -145,7 +145,7 @@ def test_what_a_name_leaves_open_is_asked_for(tmp_path, column):
     written(tmp_path / "sweep.csv", f"f_Hz;F_N;{column};phase_deg")
     code, listed = run_import(tmp_path / "sweep.csv")
     assert code == 0
-    assert "UNIT, which the file does not say" in listed
+    assert "UNIT, which the file does not state" in listed
 
 
 TIME = np.arange(400) / 2000
@@ -175,16 +175,16 @@ def test_records_have_the_units_of_their_names(tmp_path, names, units):
     assert code == 0
     (line,) = [line for line in listed.splitlines() if line.startswith("  snrmjax import")]
     words = [*shlex.split(line)[2:-2], *([] if "--record" in line else ["--record", "broadband"])]
-    code, said = run_import(*words, "--out", tmp_path / "out")
-    assert code == 0, said
+    code, output = run_import(*words, "--out", tmp_path / "out")
+    assert code == 0, output
     written_names = ["--force", names.split(";")[1], "--response", names.split(";")[2]]
     more = [*written_names, "--record", "broadband", "--out", tmp_path / "as_written"]
-    code, said = run_import(tmp_path / "run.csv", *more)
-    assert code == 0, said
+    code, output = run_import(tmp_path / "run.csv", *more)
+    assert code == 0, output
     wanted = np.array([TIME, force, velocity]).T
     for folder in ("out", "as_written"):
-        held = np.loadtxt(tmp_path / folder / "record.csv", delimiter=",", skiprows=1)
-        np.testing.assert_allclose(held, wanted, rtol=1e-12, atol=1e-15)
+        imported = np.loadtxt(tmp_path / folder / "record.csv", delimiter=",", skiprows=1)
+        np.testing.assert_allclose(imported, wanted, rtol=1e-12, atol=1e-15)
 
 
 def test_a_rate_in_the_unit_of_its_name_and_roles_by_unit():

@@ -1,4 +1,4 @@
-"""MATLAB files of level 5 whose elements do not fit: refused before scipy follows them."""
+"""MATLAB 5 files with inconsistent elements: refused before scipy reads them."""
 
 import struct
 import zlib
@@ -13,7 +13,7 @@ from snrmjax.io.laboratory import read_laboratory_file
 from snrmjax.io.laboratory.arrays.matlab_elements import checked_variables
 
 HERTZ = np.array([79.0, 79.5, 80.0])
-TEXT = struct.pack("<IIIIII", 6, 8, 4, 0, 5, 8)  # flags of a text, and the tag of its sides
+TEXT = struct.pack("<IIIIII", 6, 8, 4, 0, 5, 8)  # flags of a text, and the tag of its dimensions
 STRUCT = struct.pack("<IIIIII", 6, 8, 2, 0, 5, 8)
 CELL = struct.pack("<IIIIII", 6, 8, 1, 0, 5, 8)
 
@@ -25,7 +25,7 @@ def write_test(path):
 
 
 def with_bytes(content, behind, at, new):
-    """Other bytes at a place behind a mark."""
+    """Replace bytes at an offset after a mark."""
     start = content.index(behind) + len(behind) + at
     content[start : start + len(new)] = new
 
@@ -44,7 +44,10 @@ def longer_array(content):
 
 
 DAMAGES = {
-    "a text without sides": (lambda c: with_bytes(c, TEXT, -4, bytes(4)), r"the sides \(\)"),
+    "a text without dimensions": (
+        lambda c: with_bytes(c, TEXT, -4, bytes(4)),
+        r"the dimensions \(\)",
+    ),
     "many structs": (
         lambda c: with_bytes(c, STRUCT, 4, b"nan\0"),
         "without its contents|fewer are left",
@@ -53,9 +56,9 @@ DAMAGES = {
         lambda c: with_bytes(c, CELL, 4, struct.pack("<i", 2**20)),
         "without its contents",
     ),
-    "a side below zero": (
+    "a dimension below zero": (
         lambda c: with_bytes(c, CELL, 0, struct.pack("<i", -1)),
-        r"the sides \(-1, 2\)",
+        r"the dimensions \(-1, 2\)",
     ),
     "numbers of no type": (number_kind, "type 11"),
     "an array within another": (longer_array, "more than its contents"),
@@ -84,11 +87,11 @@ def test_what_does_not_fit_is_refused(tmp_path, damage):
 def test_a_command_ends_with_one_sentence(tmp_path):
     """A text without sides ended the process within scipy."""
     content = write_test(tmp_path / "test.mat")
-    DAMAGES["a text without sides"][0](content)
+    DAMAGES["a text without dimensions"][0](content)
     (tmp_path / "test.mat").write_bytes(content)
-    code, said = run_import(tmp_path / "test.mat")
+    code, output = run_import(tmp_path / "test.mat")
     assert code == 2
-    assert said.count("is damaged or is not a MATLAB file") == 1
+    assert output.count("is damaged or is not a MATLAB file") == 1
 
 
 def compressed(element, packed=None):
@@ -96,16 +99,16 @@ def compressed(element, packed=None):
     return struct.pack("<II", 15, len(packed)) + packed
 
 
-def test_compressed_variables_are_checked_alike(tmp_path):
+def test_compressed_variables_are_checked_too(tmp_path):
     path = tmp_path / "test.mat"
     content = write_test(path)
     head, element = bytes(content[:128]), bytes(content[128:])
     path.write_bytes(head + compressed(element))
     assert read_laboratory_file(path).tables[0].columns.keys() == {"frequency", "v"}
-    DAMAGES["a text without sides"][0](content)
+    DAMAGES["a text without dimensions"][0](content)
     checksum = zlib.compress(element)[:-1] + b"\0"
     for packed, complaint in (
-        (compressed(bytes(content[128:])), r"the sides \(\)"),
+        (compressed(bytes(content[128:])), r"the dimensions \(\)"),
         (compressed(b"", checksum), "incorrect data check"),
         (compressed(element[:-8]), "another size than stated"),
         (compressed(element[:4] + struct.pack("<I", 2**31) + bytes(99)), "cannot hold"),
@@ -118,7 +121,7 @@ def test_compressed_variables_are_checked_alike(tmp_path):
 def test_what_takes_no_byte_is_few(tmp_path):
     """Blanks and structs without fields: their number alone takes memory and time."""
     path = tmp_path / "test.mat"
-    for value, complaint in (("", "letters and no byte"), ({}, "structs and no field")):
+    for value, complaint in (("", "characters and no byte"), ({}, "structs and no field")):
         scipy.io.savemat(path, {"frequency": HERTZ, "note": value})
         content = bytearray(path.read_bytes())
         mark = TEXT if value == "" else STRUCT

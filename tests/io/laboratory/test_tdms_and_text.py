@@ -1,4 +1,4 @@
-"""TDMS by nptdms' writer, and separated text as programs of several countries write it."""
+"""TDMS written by nptdms, and separated text as written in several countries."""
 
 import struct
 
@@ -28,18 +28,18 @@ def test_a_waveform_of_labview(tmp_path):
                 ]
             )
         writer.write_segment([ChannelObject("Steps", "frequency", frequency, {})])
-    found = read_laboratory_file(path)
-    (record,) = found.recordings
+    contents = read_laboratory_file(path)
+    (record,) = contents.recordings
     assert (record.sampling_rate, record.start_time) == (2048.0, 0.5)
     assert [one.quantity for one in record.channels] == ["force", "acceleration"]
     np.testing.assert_array_equal(record.values()[0], force * 4.4482216152605)
     np.testing.assert_array_equal(record.values(["CH2"], 95, 205)[0], response[95:205])
-    assert found.tables[0].name == "Steps"
-    np.testing.assert_array_equal(found.tables[0].columns["frequency"], frequency)
+    assert contents.tables[0].name == "Steps"
+    np.testing.assert_array_equal(contents.tables[0].columns["frequency"], frequency)
 
 
 def test_spectra_and_complex_channels(tmp_path):
-    """An even abscissa in Hz is a frequency; its steps are no interval between samples."""
+    """An even abscissa in Hz is a frequency, not a time axis."""
     path = tmp_path / "spectra.tdms"
     lines = {"wf_increment": 0.25, "wf_start_offset": 20.0, "wf_xunit_string": "Hz"}
     values = np.random.default_rng(4).normal(size=(2, 80))
@@ -53,14 +53,16 @@ def test_spectra_and_complex_channels(tmp_path):
                 ChannelObject("Spectra", "log", stamps, {}),
             ]
         )
-    found = read_laboratory_file(path)
-    assert found.recordings == ()
-    (table,) = found.tables
+    contents = read_laboratory_file(path)
+    assert contents.recordings == ()
+    (table,) = contents.tables
     np.testing.assert_array_equal(table.columns["frequency"], 20 + np.arange(80) / 4)
     np.testing.assert_array_equal(table.columns["H1"], response)
     assert table.units == {"frequency": "Hz", "H1": "g"}
     np.testing.assert_array_equal(table.columns["coherence"], values[0])
-    assert [dict(note) for note in found.notes] == [{"name": "channel log", "why": "times_of_day"}]
+    assert [dict(note) for note in contents.notes] == [
+        {"name": "channel log", "why": "times_of_day"}
+    ]
 
 
 def text_of_tdms(word):
@@ -114,7 +116,7 @@ def test_interleaved_segments_written_by_hand(tmp_path):
 
 
 @pytest.mark.parametrize("index", ["of another record", "garbage"])
-def test_an_index_beside_a_tdms_file_is_not_believed(tmp_path, index):
+def test_an_index_next_to_a_tdms_file_is_ignored(tmp_path, index):
     samples = np.random.default_rng(6).normal(size=(200, 2))
     path = tmp_path / "log.tdms"
     path.write_bytes(segment(*interleaved(samples)))
@@ -140,9 +142,9 @@ def test_a_tdms_that_states_more_than_it_has_is_refused(tmp_path):
 def test_a_word_among_numbers_and_lines_of_comment(tmp_path):
     path = tmp_path / "export.csv"
     path.write_text("f,F\n# one\n79,1\n80,2\n% two\n\n81,3\n# end\n")
-    found = read_laboratory_file(path)
-    np.testing.assert_array_equal(found.tables[0].columns["F"], [1, 2, 3])
-    assert [note["n"] for note in found.notes if note.kind == "comments_not_read"] == [2]
+    contents = read_laboratory_file(path)
+    np.testing.assert_array_equal(contents.tables[0].columns["F"], [1, 2, 3])
+    assert [note["n"] for note in contents.notes if note.kind == "comments_not_read"] == [2]
     path.write_text("f,F\n79,1\n80,-.-\n81,3\n")
     with pytest.raises(ValueError, match=r"column F must be numbers, but row 3 of export\.csv"):
         read_laboratory_file(path)
@@ -183,18 +185,18 @@ def test_a_record_of_text_and_a_column_of_words(tmp_path):
     path = tmp_path / "record.csv"
     rows = "\n".join(f"{k / 1024!r},{k % 7},on" for k in range(100))
     path.write_text(f"Time (s),CH1 (mV),state\n{rows}\n")
-    found = read_laboratory_file(path)
-    (record,) = found.recordings
+    contents = read_laboratory_file(path)
+    (record,) = contents.recordings
     assert record.sampling_rate == 1024
     np.testing.assert_allclose(record.values()[0], np.arange(100) % 7 * 1e-3, rtol=1e-15)
     assert [one.name for one in record.channels] == ["CH1"]
 
 
-def test_told_formats_win(tmp_path):
+def test_stated_formats_take_precedence(tmp_path):
     path = tmp_path / "odd.csv"
     path.write_text("1,2\na,b\nHz,N\n79,1\n80,2\n")
-    told = TextFormat("comma", "point", 2)
-    (table,) = read_laboratory_file(path, told).tables
+    text_format = TextFormat("comma", "point", 2)
+    (table,) = read_laboratory_file(path, text_format).tables
     assert table.units == {"a": "Hz", "b": "N"}
     np.testing.assert_array_equal(table.columns["b"], [1, 2])
 

@@ -1,4 +1,4 @@
-"""Texts that describe themselves, as controllers, LabVIEW and vibrometers write them."""
+"""Self-describing texts as written by controllers, LabVIEW and vibrometers."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ END = "***End_of_Header***"
 
 
 def lvm(separator="\t", decimal=".", x_columns="No", *, step="1.000000E-3", rows=None, **header):
-    """A measurement file of LabVIEW with one segment or more, as its specification says."""
+    """A LabVIEW measurement file with one or more segments, by its specification."""
     sides = 1 if x_columns != "Multi" else 2
 
     def line(*fields):
@@ -59,9 +59,9 @@ def lvm(separator="\t", decimal=".", x_columns="No", *, step="1.000000E-3", rows
     return "\n".join(lines) + "\n"
 
 
-def read(tmp_path, text, name="test.lvm", encoding="utf-8", **told):
+def read(tmp_path, text, name="test.lvm", encoding="utf-8", **text_format):
     (tmp_path / name).write_bytes(text.encode(encoding))
-    return read_laboratory_file(tmp_path / name, TextFormat(**told) if told else None)
+    return read_laboratory_file(tmp_path / name, TextFormat(**text_format) if text_format else None)
 
 
 @pytest.mark.parametrize(
@@ -75,9 +75,9 @@ def read(tmp_path, text, name="test.lvm", encoding="utf-8", **told):
     ],
 )
 def test_labview_measurement_files(tmp_path, separator, decimal, x_columns):
-    found = read(tmp_path, lvm(separator, decimal, x_columns))
-    (record,) = found.recordings
-    assert (found.kind, record.sampling_rate, record.start_time) == ("lvm", 1000.0, 0.0)
+    contents = read(tmp_path, lvm(separator, decimal, x_columns))
+    (record,) = contents.recordings
+    assert (contents.kind, record.sampling_rate, record.start_time) == ("lvm", 1000.0, 0.0)
     assert [one.quantity for one in record.channels] == ["force", "velocity"]
     np.testing.assert_allclose(record.values(["Force"])[0], FORCE, rtol=0, atol=5.1e-10)
     np.testing.assert_allclose(record.values(["Tip velocity"])[0], 1e-3 * MOTION, atol=5.1e-13)
@@ -85,18 +85,18 @@ def test_labview_measurement_files(tmp_path, separator, decimal, x_columns):
 
 def test_segments_ragged_ends_and_few_digits_of_labview(tmp_path):
     text = lvm(rows=[[FORCE, MOTION[:70]], [FORCE, MOTION]], step="0.000977")
-    found = read(tmp_path, text)
-    assert [one.n_samples for one in found.recordings] == [70, 80]
-    assert "Force has further samples than the 70" in " ".join(map(str, found.notes))
-    assert {one.sampling_rate for one in found.recordings} == {1024.0}
-    assert any("only whole rate" in str(note) for note in found.notes)
+    contents = read(tmp_path, text)
+    assert [one.n_samples for one in contents.recordings] == [70, 80]
+    assert "Force has more samples than the 70" in " ".join(map(str, contents.notes))
+    assert {one.sampling_rate for one in contents.recordings} == {1024.0}
+    assert any("only integer rate" in str(note) for note in contents.notes)
     late = {"Date": ["2026/01/05"] * 2, "Time": ["10:00:00.000", "10:00:00.020"]}
-    found = read(tmp_path, lvm(**late))
-    (record,) = found.recordings
+    contents = read(tmp_path, lvm(**late))
+    (record,) = contents.recordings
     assert record.n_samples == 60  # of 80, where both are
     np.testing.assert_allclose(record.values(["Force"])[0], FORCE[20:], atol=5.1e-10)
     np.testing.assert_allclose(record.values(["Tip velocity"])[0], 1e-3 * MOTION[:60], atol=1e-12)
-    assert "Force began 20 ms earlier" in " ".join(map(str, found.notes))
+    assert "Force began 20 ms earlier" in " ".join(map(str, contents.notes))
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ PHASE = [-95.4, -95.7, -96.0, -96.4]
 
 
 def runs(separator, decimal, head, labels, *, shared=True, end=""):
-    """Two runs side by side, the second backwards."""
+    """Two adjacent runs, the second backwards."""
 
     def line(*fields):
         return separator.join(str(field).replace(".", decimal) for field in fields) + end
@@ -168,8 +168,8 @@ def test_a_trailing_separator_adds_no_column_and_a_row_of_names_is_obeyed(tmp_pa
     text = "f [Hz]\tv [mm/s]\tph [deg]\t\n1,5\t2,5\t-3\t\n2,5\t3,5\t-4\t\n"
     (table,) = read(tmp_path, text, "a.txt").tables
     assert list(table.columns) == ["f", "v", "ph"]
-    (told,) = read(tmp_path, text, "a.txt", header_row=1).tables
-    assert told.units == table.units == {"f": "Hz", "v": "mm/s", "ph": "deg"}
+    (stated,) = read(tmp_path, text, "a.txt", header_row=1).tables
+    assert stated.units == table.units == {"f": "Hz", "v": "mm/s", "ph": "deg"}
     below = "title\tof a test\n" + text
     with pytest.raises(ValueError, match=r"--header-row 1 of a\.txt has 2 names, but .* 3 columns"):
         read(tmp_path, below, "a.txt", header_row=1)
@@ -194,13 +194,13 @@ def test_channels_in_several_files_are_one_record(tmp_path):
     (tmp_path / "velocity.txt").write_text(vibrometer("Vib Velocity", "mm/s", MOTION))
     files = tmp_path / "force.txt", tmp_path / "velocity.txt"
     words = ["--force", "Ref1 Force", "--response", "Vib Velocity", "--record", "broadband"]
-    code, said = run_import(*files, *words, "--out", tmp_path / "out")
-    assert code == 0, said
-    held = np.loadtxt(tmp_path / "out" / "record.csv", delimiter=",", skiprows=1)
-    np.testing.assert_allclose(held[:, 1:], np.stack([FORCE, 1e-3 * MOTION], axis=1), rtol=1e-15)
-    code, said = run_import(files[0], *words[:3], "Ref1 Force:velocity:m/s", "--out", tmp_path)
+    code, output = run_import(*files, *words, "--out", tmp_path / "out")
+    assert code == 0, output
+    record = np.loadtxt(tmp_path / "out" / "record.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(record[:, 1:], np.stack([FORCE, 1e-3 * MOTION], axis=1), rtol=1e-15)
+    code, output = run_import(files[0], *words[:3], "Ref1 Force:velocity:m/s", "--out", tmp_path)
     assert code == 2
-    assert "as the response and as what drives the structure" in said
+    assert "as the response and as the excitation" in output
 
 
 def test_a_number_of_very_many_digits_is_a_number(tmp_path):
@@ -225,9 +225,9 @@ def test_separators_of_thousands(tmp_path, separator, mark, decimal):
 
     truth = [(998, 0.5, 1250.25, 12), (1000, 0.5, 1391, 1234567), (1001, 0.5, 1.25, -40)]
     head = separator.join(["f [Hz]", "F [N]", "v [mm/s]", "n"])
-    held = read(tmp_path, "\n".join([head, *(row(*one) for one in truth)]), "a.csv")
-    np.testing.assert_array_equal(np.transpose(list(held.tables[0].columns.values())), truth)
-    assert sum(note.kind == "thousands" for note in held.notes) == 3
+    contents = read(tmp_path, "\n".join([head, *(row(*one) for one in truth)]), "a.csv")
+    np.testing.assert_array_equal(np.transpose(list(contents.tables[0].columns.values())), truth)
+    assert sum(note.kind == "thousands" for note in contents.notes) == 3
 
 
 @pytest.mark.parametrize(
@@ -246,19 +246,19 @@ def test_thousands_that_may_be_decimals_are_asked_about(
     with pytest.raises(ValueError, match=f"{complaint}.*--decimal point or comma"):
         read(tmp_path, text, "a.csv")
     for decimal, wanted in (("point", by_point), ("comma", by_comma)):
-        told = {"separator": "semicolon", "decimal": decimal}
-        (table,) = read(tmp_path, text, "a.csv", **told).tables
+        text_format = {"separator": "semicolon", "decimal": decimal}
+        (table,) = read(tmp_path, text, "a.csv", **text_format).tables
         assert table.columns["f"].tolist() == wanted
 
 
 def test_decimals_of_three_digits_and_columns_of_another_mark(tmp_path):
     (table,) = read(tmp_path, "f v\n79.125 1.250\n80.000 1.391\n", "a.csv").tables
     assert table.columns["v"].tolist() == [1.25, 1.391]
-    held = read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;1.391\n", "a.csv")
-    assert [one.tolist() for one in held.tables[0].columns.values()] == [
+    contents = read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;1.391\n", "a.csv")
+    assert [one.tolist() for one in contents.tables[0].columns.values()] == [
         *([998, 1000], [0.5, 0.5], [1.25, 1.391])
     ]
-    assert [note.kind for note in held.notes][:2] == ["thousands", "other_decimal"]
+    assert [note.kind for note in contents.notes][:2] == ["thousands", "other_decimal"]
     with pytest.raises(ValueError, match=r"v of a\.csv has decimal commas and decimal points"):
         read(tmp_path, "f;F;v\n998;0,5;1.25\n1.000;0,5;12,3911\n", "a.csv")
 
@@ -275,12 +275,12 @@ def test_decimals_of_three_digits_and_columns_of_another_mark(tmp_path):
 def test_times_of_few_digits_are_even(tmp_path, rate, digits, n, start, unit, cut):
     times = (start + np.arange(n) / rate) / unit
     words = [f"{one:{digits}}" for one in times]
-    if cut:  # of the decimals of the first step, as some programs do not round
+    if cut:  # truncated, as by programs that do not round
         words = [repr(float(np.floor(one * 1e5 + 1e-6)) / 1e5) for one in times]
     name = "t [ms]" if unit == 1e-3 else "t [s]"
     rows = [f"{word},{0.1 * k!r}" for k, word in enumerate(words)]
-    held = read(tmp_path, "\n".join([f"{name},v [m/s]", *rows]), "a.csv")
-    (record,) = held.recordings
+    contents = read(tmp_path, "\n".join([f"{name},v [m/s]", *rows]), "a.csv")
+    (record,) = contents.recordings
     tolerance = 1e-4 if cut else 1e-12
     assert record.sampling_rate == pytest.approx(rate, rel=tolerance)
     assert record.start_time == pytest.approx(start, abs=1e-4 * unit)
@@ -294,9 +294,9 @@ def test_uneven_times_of_few_digits_stay_a_column_and_an_open_rate_is_stated(tmp
     (note,) = (n for n in read_laboratory_file(path).notes if n.kind == "rate_left_open")
     assert note["rate"] == 5120
     words = (path, "--rate", 5120, "--record", "decay", "--response", "v", "--out", tmp_path / "o")
-    code, said = run_import(*words)
+    code, output = run_import(*words)
     assert code == 0
-    assert "few digits" not in said
+    assert "few digits" not in output
     record = read_record_table(tmp_path / "o" / "record.csv")
     assert record.sampling_rate == pytest.approx(5120, rel=1e-12)
     # The same times in a table of our own, then with a gap of two samples.

@@ -1,4 +1,4 @@
-"""Universal files: written by hand as the format says, by pyuff, and by ourselves."""
+"""Universal files: written by hand from the specification, by pyuff, and by ourselves."""
 
 import subprocess
 import sys
@@ -65,9 +65,9 @@ def by_pyuff(tmp_path_factory):
 def test_a_file_by_hand_in_inches_and_pounds(tmp_path):
     path = tmp_path / "inches.unv"
     path.write_text(HAND)
-    found = read_laboratory_file(path)
-    (one,) = found.responses
-    assert found.levels == (2.5,)
+    contents = read_laboratory_file(path)
+    (one,) = contents.responses
+    assert contents.levels == (2.5,)
     assert one.responses[0].point == "12"
     assert one.responses[0].direction == "+z"
     assert one.references[0].direction == "-x"
@@ -77,7 +77,7 @@ def test_a_file_by_hand_in_inches_and_pounds(tmp_path):
     np.testing.assert_allclose(one.values[0, 0], expected, rtol=1e-12)
 
 
-# What programs put around functions: a header, nodes in two forms, elements, qualifiers.
+# Data sets that programs add: a header, nodes in two forms, elements, qualifiers.
 AROUND = """    -1
    151
 frame
@@ -104,23 +104,23 @@ frame
 """
 
 
-def test_what_stands_around_functions_is_listed_and_in_nobodys_way(tmp_path):
+def test_other_data_sets_are_listed_and_do_not_interfere(tmp_path):
     path = tmp_path / "whole.unv"
     path.write_text(AROUND + HAND)
-    found = read_laboratory_file(path)
-    assert len(found.responses) == 1
-    assert found.tables == ()
-    left_out = {note["type"] for note in found.notes if note.kind == "data_sets_not_read"}
+    contents = read_laboratory_file(path)
+    assert len(contents.responses) == 1
+    assert contents.tables == ()
+    left_out = {note["type"] for note in contents.notes if note.kind == "data_sets_not_read"}
     assert {2411, 2412, 1858} <= left_out
     words = ("--response", "12+z:acceleration", "--force-amplitude", "0.5", "--sensor", "tip")
-    code, said = run_import(path, *words, "--out", tmp_path / "out")
-    assert code == 0, said
+    code, output = run_import(path, *words, "--out", tmp_path / "out")
+    assert code == 0, output
     path.write_text(AROUND)
     with pytest.raises(ValueError, match=r"type 2412 \(elements\) not read"):
         read_laboratory_file(path)
 
 
-def test_labels_of_windows_and_records_without_a_place(tmp_path):
+def test_labels_of_windows_and_records_without_a_point(tmp_path):
     path = tmp_path / "western.unv"
     label = "(1/N)*(mm/s²)"
     text = HAND.replace(
@@ -184,20 +184,20 @@ def test_round_trip_of_records_and_responses(tmp_path, binary):
     )
     path = tmp_path / "mine.uff"
     write_uff(path, recordings=[record], responses=[responses], levels=[0.5], binary=binary)
-    found = read_laboratory_file(path)
-    (back,) = found.recordings
+    contents = read_laboratory_file(path)
+    (back,) = contents.recordings
     assert (back.sampling_rate, back.start_time) == (51200, -0.25)
     assert back.channels == tuple(channels)
     if binary:
         np.testing.assert_array_equal(back.values(), record.values())
-        np.testing.assert_array_equal(found.responses[0].frequency, responses.frequency)
-        np.testing.assert_array_equal(found.responses[0].values, responses.values)
-        np.testing.assert_array_equal(found.responses[0].coherence, responses.coherence)
-        assert found.levels == (0.5,)
+        np.testing.assert_array_equal(contents.responses[0].frequency, responses.frequency)
+        np.testing.assert_array_equal(contents.responses[0].values, responses.values)
+        np.testing.assert_array_equal(contents.responses[0].coherence, responses.coherence)
+        assert contents.levels == (0.5,)
     else:  # twelve digits of values, six of uneven abscissae: the format's own precision
         np.testing.assert_allclose(back.values(), record.values(), rtol=6e-12)
-        assert "frequencies_do_not_rise" in [note.kind for note in found.notes]
-        (table,) = found.tables
+        assert "frequencies_do_not_rise" in [note.kind for note in contents.notes]
+        (table,) = contents.tables
         np.testing.assert_allclose(table.columns["frequency"], hertz, atol=5.1e-5)
         np.testing.assert_allclose(
             table.columns["3-y over force"], responses.values[0, 0], rtol=6e-12
@@ -209,7 +209,7 @@ def test_round_trip_of_records_and_responses(tmp_path, binary):
     [
         (lambda text: text[:-40], "within a data set"),
         (lambda text: text.replace("         5         3", "         5999999999"), "cannot hold"),
-        (lambda text: text.replace("         5         3", "         5         9"), "holds 3"),
+        (lambda text: text.replace("         5         3", "         5         9"), "has 3"),
         (lambda text: text.replace("         5         3", "         7         3"), "type 7"),
         (lambda text: text.replace("  1.00000E+00", "  one        "), "damaged"),
         (lambda text: text.replace("3.93700787401574800D+01", "0.00000000000000000D+00"), "posit"),

@@ -1,4 +1,4 @@
-"""Units: our table against Pint's, and what a base install says without Pint."""
+"""Units: our table against Pint's, and the messages of a base install without Pint."""
 
 import sys
 from decimal import Decimal
@@ -31,9 +31,9 @@ GRAVITY, POUND = 9.80665, 4.4482216152605
     ],
 )
 def test_units_of_the_table(text, dimension, factor):
-    found = unit_meaning(text)
-    assert found.dimension == dimension
-    assert found.factor == pytest.approx(factor, rel=1e-15)
+    meaning = unit_meaning(text)
+    assert meaning.dimension == dimension
+    assert meaning.factor == pytest.approx(factor, rel=1e-15)
 
 
 def test_sensitivities_and_suffixes():
@@ -51,13 +51,15 @@ def test_sensitivities_and_suffixes():
             unit_meaning(text)
 
 
-def test_the_table_has_the_sizes_of_pint():
+def test_the_table_has_the_factors_of_pint():
     registry = pint.UnitRegistry(non_int_type=Decimal, cache_folder=None)
     named = "m in ft mm µm micron N kN lbf kgf V mV A s ms min h kg Hz kHz rpm rad deg Pa meters"
     for name in named.split():
         base = registry.Quantity(Decimal(1), registry.parse_units(name)).to_base_units()
-        turns = 2 * np.pi if name.endswith("Hz") else 1
-        assert unit_meaning(name).factor == pytest.approx(float(base.magnitude) * turns, rel=1e-15)
+        to_radians = 2 * np.pi if name.endswith("Hz") else 1
+        assert unit_meaning(name).factor == pytest.approx(
+            float(base.magnitude) * to_radians, rel=1e-15
+        )
 
 
 def test_a_base_install_knows_common_units_and_names_the_package_for_others(monkeypatch):

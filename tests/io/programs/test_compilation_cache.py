@@ -1,4 +1,4 @@
-"""Programs that one process leaves on disk and the next one reads."""
+"""Programs that one process stores on disk and the next one loads."""
 
 import os
 import subprocess

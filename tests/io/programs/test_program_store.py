@@ -1,4 +1,4 @@
-"""Whole programs on disk: found by all that they depend on, and by nothing else."""
+"""Programs stored on disk, identified by all of their inputs and nothing else."""
 
 import json
 import os
@@ -54,11 +54,11 @@ class TestKeys:
         assert len(set(keys)) == len(keys)
 
     def test_a_static_number_is_part_of_the_key(self):
-        described = program_store._described
-        assert described(0.5) == described(0.25)
-        assert described(0.5, fixed=True) != described(0.25, fixed=True)
+        key = program_store._argument_key
+        assert key(0.5) == key(0.25)
+        assert key(0.5, fixed=True) != key(0.25, fixed=True)
         with pytest.raises(NotKept):
-            described(np.ones(2), fixed=True)  # of which only shape and type would be told
+            key(np.ones(2), fixed=True)  # the key would have only shape and type
 
     def test_code_of_others_is_not_kept(self):
         class Own(eqx.Module):
@@ -99,7 +99,7 @@ def test_old_versions_make_room(tmp_path):
         os.utime(tmp_path / str(k), (k, k))
     program_store._drop_old(tmp_path)
     assert sorted(os.listdir(tmp_path)) == ["3", "4"]
-    program_store._drop_old(tmp_path / "none")  # and nothing is made of none
+    program_store._drop_old(tmp_path / "none")  # nothing is created
 
 
 SCRIPT = """
@@ -131,7 +131,7 @@ print(json.dumps([[float(n).hex() for n in numbers], heard.count(sys.argv[2])]))
 
 
 def ran(folder: Path, *further: str) -> tuple[list[str], int]:
-    """The digits of a process, and how many programs it compiled."""
+    """The digits of a process, and its number of compiled programs."""
     done = subprocess.run(
         [
             *(sys.executable, "-c", SCRIPT, folder),
@@ -146,7 +146,7 @@ def ran(folder: Path, *further: str) -> tuple[list[str], int]:
     return tuple(json.loads(done.stdout.splitlines()[-1]))
 
 
-def test_the_second_process_has_the_digits_of_the_first_and_damaged_files_are_passed_over(tmp_path):
+def test_the_second_process_has_the_digits_of_the_first_and_damaged_files_are_ignored(tmp_path):
     digits, compiled = ran(tmp_path)
     programs = [file for file in (tmp_path / "programs").rglob("*") if file.is_file()]
     assert len(programs) == 4  # terms, Newton's method with LAPACK, energy, response
@@ -158,10 +158,10 @@ def test_the_second_process_has_the_digits_of_the_first_and_damaged_files_are_pa
         file.write_bytes(content[: len(content) // 2])
     programs[0].write_bytes(b"")
     programs[1].write_bytes(bytes(1000))
-    mended, once_more = ran(tmp_path)
-    assert mended == digits
+    repaired, once_more = ran(tmp_path)
+    assert repaired == digits
     assert once_more - left >= len(programs)
-    assert all(file.stat().st_size > 1000 for file in programs)  # and written anew
+    assert all(file.stat().st_size > 1000 for file in programs)  # and rewritten
 
 
 def test_with_an_effect_of_a_user_nothing_is_kept(tmp_path):

@@ -1,4 +1,4 @@
-"""A folder of load-case tables of a structure whose condensed potential is known."""
+"""A folder of load-case tables of a structure with known condensed potential."""
 
 from pathlib import Path
 from typing import NamedTuple

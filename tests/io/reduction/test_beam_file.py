@@ -1,4 +1,4 @@
-"""Beams as TOML: what they say, what is refused, and the models that come out of them."""
+"""Beams as TOML: contents, refusals, and the resulting models."""
 
 import json
 import re
@@ -47,7 +47,7 @@ def supports_of(numbers):
     return [[numbers[f"supports.{side}.{key}"] for key in keys] for side in ("left", "right")]
 
 
-def test_a_beam_file_says_what_the_description_has(tmp_path):
+def test_a_beam_file_gives_the_description(tmp_path):
     path = tmp_path / "beam.toml"
     path.write_text(BEAM)
     beam = read_beam_description(path)
@@ -107,15 +107,15 @@ BAD_BEAMS = [
     (edit('left = "clamped"', "left = { axial_nm = 1 }"), "unknown key 'axial_nm'"),
     (edit('left = "clamped"', "left = {}"), "a support or stiffnesses"),
     (edit('left = "clamped"', "left = { axial_n_m = -1 }"), "zero or positive"),
-    (edit('"clamped"', '"free"'), "leave a mechanism: nothing holds the beam along"),
+    (edit('"clamped"', '"free"'), "leave a mechanism: nothing fixes the beam along"),
     (
         edit('left = "clamped"', 'left = "free"').replace('"clamped"', '"pinned"'),
-        "leave a mechanism: nothing keeps the beam from turning",
+        "leave a mechanism: nothing prevents rotation of the beam",
     ),
     (edit("[1, 3]", "[1, 1]"), "different mode numbers"),
     (edit("[1, 3]", "[0]"), "`modes` must be a whole number from 1"),
     (edit("[1, 3]", "[]"), "at least one"),
-    (edit("[1, 3]", "[1, 13]"), "12 elements can show"),
+    (edit("[1, 3]", "[1, 13]"), "12 elements can represent"),
     (edit("[1, 3]", "[1, 3]\ndegree = 9"), "`degree` must be from 2 to 7"),
     (edit("[1, 3]", "[1, 3]\nload_scale = 0"), "`load_scale` must be positive"),
     (edit("[1, 3]", "[1, 3]\ndamping_ratio = [0.1]"), "2 numbers, one a mode"),
@@ -141,10 +141,10 @@ def refused(monkeypatch, capsys, *arguments):
     monkeypatch.setattr("sys.argv", ["snrmjax", "rom", *map(str, arguments)])
     with pytest.raises(SystemExit) as ended:
         main()
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert ended.value.code == 2
-    assert said.partition("read more: ")[0].count("\n") == 1
-    return said
+    assert message.partition("read more: ")[0].count("\n") == 1
+    return message
 
 
 @pytest.mark.parametrize(("text", "words"), BAD_BEAMS, ids=[words for _, words in BAD_BEAMS])
@@ -197,7 +197,7 @@ def test_a_beam_becomes_a_model_that_simulates(tmp_path, monkeypatch):
     assert summary["notes"] == []
 
 
-def test_damping_is_assumed_aloud_and_a_force_may_be_at_a_point(tmp_path):
+def test_assumed_damping_is_noted_and_a_force_may_be_at_a_point(tmp_path):
     path = tmp_path / "beam.toml"
     path.write_text(edit("[1, 3]", "[1]").replace('distribution = "uniform"', "at = 0.5"))
     source = read_beam(path)
@@ -215,14 +215,14 @@ def test_a_heavy_point_mass_swings_on_the_static_stiffness_of_the_beam(tmp_path)
     path.write_text(edit("[1, 3]", "[1]") + MASS.replace("1e-3", "1.0"))
     source = read_beam(path)
     bending = 204.8e9 * 0.0127 * 0.000508**3 / 12
-    # 192 EI/L³ at midspan of a clamped beam; 13/35 of its own 11.6 g moves along, 0.43 % of 1 kg.
+    # 192 EI/L³ at midspan of a clamped beam; 13/35 of its 11.6 g move with it, 0.43 % of 1 kg.
     assert float(source.basis.frequency[0]) == pytest.approx(
         np.sqrt(192 * bending / 0.2286**3 / 1.0043), rel=1e-3
     )
     assert float(source.sensors["midspan"][0]) == pytest.approx(1.0, rel=3e-3)  # 1/√kg
 
 
-def test_a_beam_file_is_told_from_a_model_file(tmp_path):
+def test_a_beam_file_is_distinguished_from_a_model_file(tmp_path):
     for text, expected in (
         (BEAM, True),
         ("[material]\n", True),
@@ -240,20 +240,20 @@ def test_models_of_a_beam_are_functions_of_its_numbers(tmp_path):
     thin, thick = (models({"section.thickness_m": h}) for h in (0.0004, 0.0005))
     frequency = [float(m.modes.natural_frequency[0]) for m in (thin, thick)]
     cubic = [sj.model.parameter_values(m)["potential.1111"] for m in (thin, thick)]
-    # A clamped beam: frequency by its thickness, but for shear and rotary inertia, (h/L)²; cubic
-    # coefficient E φ⁴/(ρ² A L⁵) by one over it: load cases in thicknesses leave the same out.
+    # A clamped beam: frequency ∝ h except for shear and rotary inertia, (h/L)²; cubic coefficient
+    # E φ⁴/(ρ² A L⁵) ∝ 1/h: load cases in thicknesses have the same truncation error.
     assert frequency[1] / frequency[0] == pytest.approx(1.25, rel=3e-5)
     assert cubic[1] / cubic[0] == pytest.approx(0.8, rel=1e-4)
     damped = models({"mode_2.damping_ratio": 0.04, "force_n": 3.0})
     np.testing.assert_allclose(damped.modes.damping_ratio, [0.01, 0.04])
 
-    def told(values):
+    def backbone_frequency(values):
         model = models(values)
         return sj.simulate.normal_mode_at_velocities(model, 0.1, harmonic_order=3).frequency[0]
 
-    # That the whole chain can be traced and derived; its values are a long test's.
+    # The whole chain can be traced and differentiated; a long test checks the values.
     start = {"section.thickness_m": 5e-4, "geometry.rise_m": 3e-4}
-    slope = jax.eval_shape(lambda one: jax.jvp(told, (one,), (one,))[1], start)
+    slope = jax.eval_shape(lambda one: jax.jvp(backbone_frequency, (one,), (one,))[1], start)
     assert slope.shape == ()
     for values, words in (
         ({"section.thickness": 1e-3}, "did you mean `section.thickness_m`"),

@@ -44,13 +44,13 @@ def models_in(folder, text):
     return sj.io.read_beam_models(folder / "beam.toml")
 
 
-def differences(told, size):
+def differences(outputs, n_parameters):
     """Central differences of the whole chain by relative changes, of sixth order."""
     weights = {1: 45 / 60, 2: -9 / 60, 3: 1 / 60}
     each = []
-    for one in np.eye(size):
+    for one in np.eye(n_parameters):
         parts = [
-            w * (np.asarray(told(k * STEP * one)) - np.asarray(told(-k * STEP * one)))
+            w * (np.asarray(outputs(k * STEP * one)) - np.asarray(outputs(-k * STEP * one)))
             for k, w in weights.items()
         ]
         each.append(sum(parts) / STEP)
@@ -71,21 +71,21 @@ def test_derivatives_of_mode_and_peak_are_differences_of_the_whole_chain(tmp_pat
 
     nominal = peak_of(models({}))
 
-    def told(change):
+    def outputs(change):
         traced = isinstance(change, jax.core.Tracer)
         values = middle * (1 + change)
         model = models(dict(zip(names, values if traced else values.tolist(), strict=True)))
         mode = sj.simulate.normal_mode_at_velocities(model, [0.05, 0.2], harmonic_order=5)
-        # From its own curve: near the nominal peak another one may be nearer to Newton's method.
+        # Start from the model's own curve, since Newton's method may converge to another peak.
         start = nominal if traced else peak_of(model)
         peak = sj.simulate.periodic_motion(model, 0.02, start, condition="peak")
         return jnp.stack([*mode.frequency, peak.frequency, peak.amplitude])
 
-    found = np.asarray(jax.jit(jax.jacfwd(told))(jnp.zeros(len(names))))
-    backwards = np.asarray(jax.jit(jax.jacrev(told))(jnp.zeros(len(names))))
-    expected = differences(told, len(names))
-    error = np.abs(found - expected) / np.abs(expected)
-    np.testing.assert_allclose(backwards, found, rtol=1e-6)
+    forward = np.asarray(jax.jit(jax.jacfwd(outputs))(jnp.zeros(len(names))))
+    backward = np.asarray(jax.jit(jax.jacrev(outputs))(jnp.zeros(len(names))))
+    expected = differences(outputs, len(names))
+    error = np.abs(forward - expected) / np.abs(expected)
+    np.testing.assert_allclose(backward, forward, rtol=1e-6)
     # Rounding of load cases (1e-10 of a coefficient) over steps of 1e-3; the order of the
     # differences leaves less.
     assert np.max(error) < 1e-6, error
@@ -115,7 +115,7 @@ VELOCITY = np.linspace(0.05, 0.8, 12)
 
 
 def test_thickness_and_supports_of_a_beam_come_back_from_its_backbone(tmp_path):
-    """From the traced mode of the true beam with noise: values, and coverage of their bands."""
+    """From the true beam's computed backbone with noise: values and coverage of their bands."""
     models = models_in(tmp_path, SPRUNG)
 
     def model_of(values):
@@ -131,20 +131,20 @@ def test_thickness_and_supports_of_a_beam_come_back_from_its_backbone(tmp_path):
     truth = np.array(list(TRUTH.values()))
     for _ in range(SEEDS):
         points = sj.identify.MeasuredBackbone(VELOCITY, clean + noise.normal(size=12) * std, std)
-        found = sj.identify.calibrate_to_backbone(model_of, START, points)
-        assert found.converged
-        scores.append((found.values - truth) / found.std)
+        fit = sj.identify.calibrate_to_backbone(model_of, START, points)
+        assert fit.converged
+        scores.append((fit.values - truth) / fit.std)
         inside += np.abs(scores[-1]) < 1.959964
     # Binomial 95 % ± 3σ of 120 seeds: 0.89 to 1; the mean is within 3/√120 of zero.
     assert np.all(inside / SEEDS > 0.89)
     assert np.all(np.abs(np.mean(scores, axis=0)) < 3 / np.sqrt(SEEDS))
-    np.testing.assert_allclose(found.values, truth, rtol=0.05)
+    np.testing.assert_allclose(fit.values, truth, rtol=0.05)
 
 
 SIDES, SEEDS = ("left", "right"), 120
 
 
-def test_a_backbone_that_softens_tells_the_rise_too(tmp_path):
+def test_a_softening_backbone_identifies_the_rise_too(tmp_path):
     models = models_in(tmp_path, ARCH.replace("[1, 3]", "[1]\ndegree = 5"))
     truth = {
         "material.young_pa": 195e9,
@@ -158,6 +158,6 @@ def test_a_backbone_that_softens_tells_the_rise_too(tmp_path):
     noise = np.random.default_rng(1).normal(size=24) * std
     points = sj.identify.MeasuredBackbone(velocity, np.asarray(clean.frequency) + noise, std)
     start = {name: models.parameters[name] for name in truth}
-    found = sj.identify.calibrate_to_backbone(models, start, points)
-    assert found.converged
-    assert np.all(np.abs(found.values - list(truth.values())) < 4 * found.std)
+    fit = sj.identify.calibrate_to_backbone(models, start, points)
+    assert fit.converged
+    assert np.all(np.abs(fit.values - list(truth.values())) < 4 * fit.std)

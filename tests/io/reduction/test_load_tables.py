@@ -10,8 +10,8 @@ from snrmjax.io.reduction.load_tables import read_load_tables
 
 def coefficients(folder):
     source = read_load_tables(folder.path)
-    found = sj.condense.reduced_model(source.basis, source.cases)
-    return found.potential
+    reduced = sj.condense.reduced_model(source.basis, source.cases)
+    return reduced.potential
 
 
 def check(folder, rtol=1e-7):
@@ -44,17 +44,17 @@ def test_modal_displacements_give_the_same(folder):
     check(folder)
 
 
-def test_without_mass_the_modes_are_fitted_to_the_displacements_that_were_written(folder):
-    # The pseudo-inverse is the filter where what loads add is orthogonal to the shapes.
-    turned, _ = np.linalg.qr(folder.truth.map)
-    u = np.asarray(folder.cases.displacement) @ np.linalg.inv(folder.truth.map).T @ turned.T
+def test_without_mass_the_modes_are_fitted_to_the_written_displacements(folder):
+    # The pseudo-inverse is exact where the remaining displacement is orthogonal to the shapes.
+    rotation, _ = np.linalg.qr(folder.truth.map)
+    u = np.asarray(folder.cases.displacement) @ np.linalg.inv(folder.truth.map).T @ rotation.T
     folder.replace("modes.toml", 'mass = "mass.csv"\n', "")
-    folder.write("shapes.csv", shape=turned[:, :2])
+    folder.write("shapes.csv", shape=rotation[:, :2])
     folder.write("cases.csv", case=list(folder.cases.names), f=np.asarray(folder.cases.force), u=u)
     check(folder)
 
 
-def test_what_is_not_stated_is_assumed_aloud(folder):
+def test_what_is_not_stated_is_assumed_with_a_note(folder):
     folder.replace("modes.toml", "[sensors]\ntip = [0.5, -0.25]\n", "")
     folder.replace("modes.toml", "participation = [1.0, 2.0]\n", "")
     folder.replace("modes.toml", "damping_ratio = 0.02\n", "")
@@ -159,9 +159,9 @@ BAD_TABLES = [
     (twice, "the case '+1 at 0.5' twice"),
     (kept(0), "no rows below it"),
     (kept(3), "3 usable load cases give 6 equations for 9"),
-    (scaled(5, range(3, 7), -1.0), "contradict +1 +2 at 0.5 (against their force"),
-    (scaled(2, range(3, 7), 1e3), "another unit"),
-    (every(1e3), "do not belong together"),
+    (scaled(5, range(3, 7), -1.0), "other load cases: +1 +2 at 0.5 (displaced against the force"),
+    (scaled(2, range(3, 7), 1e3), "wrong unit"),
+    (every(1e3), "are inconsistent"),
     (edit("cases.csv", "u_1,u_2,u_3,u_4", "a,b,c,d"), "unknown column 'a'"),
     (lambda folder: folder.write("cases.csv", f=np.ones((2, 3)), q=np.ones((2, 2))), "has 3 modes"),
     (lambda folder: folder.write("cases.csv", f=np.ones((2, 2)), u=np.ones((2, 3))), "has 3 degr"),
@@ -179,8 +179,8 @@ def test_bad_tables_are_refused_with_one_sentence(folder, capsys, monkeypatch, c
     monkeypatch.setattr("sys.argv", command)
     with pytest.raises(SystemExit) as ended:
         main()
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert ended.value.code == 2
-    assert words in said
-    assert said.partition("read more: ")[0].count("\n") == 1
+    assert words in message
+    assert message.partition("read more: ")[0].count("\n") == 1
     assert not out.exists()

@@ -27,7 +27,7 @@ def backbone():
     turns.terminal, turns.direction = True, 1.0
     rows = []
     for size in np.linspace(1e-5, 2.1e-3, 60):
-        found = solve_ivp(
+        result = solve_ivp(
             lambda _, s: (s[1], -(REST**2) * s[0] - duffing.DECAY_CUBIC * s[0] ** 3),
             *((0, 0.1), (size, -1e-12)),
             events=turns,
@@ -35,9 +35,9 @@ def backbone():
             rtol=1e-10,
             atol=1e-14,
         )
-        omega = np.pi / found.t_events[0][0]
+        omega = np.pi / result.t_events[0][0]
         angle = np.pi * (np.arange(100) + 0.5) / 100
-        rows.append((-2 * np.mean(found.sol(angle / omega)[1] * np.sin(angle)), omega))
+        rows.append((-2 * np.mean(result.sol(angle / omega)[1] * np.sin(angle)), omega))
     return np.array(rows).T
 
 
@@ -54,39 +54,39 @@ def interfering(mode, seed=0):
 
 
 def test_the_frequency_of_a_mode_with_company_is_its_own(mode, backbone):
-    found = sj.measure.isolate_decay(TIME, interfering(mode), 1.01 * REST)
-    true = np.interp(np.exp(found.level.real), *backbone)
+    result = sj.measure.isolate_decay(TIME, interfering(mode), 1.01 * REST)
+    true = np.interp(np.exp(result.level.real), *backbone)
     # The amplitude at which the truth is taken has its own error, along the backbone.
-    slope = found.smooth_bend.imag / found.smooth_rate.real
-    score = (found.rate.imag - true) / np.hypot(found.rate_std.imag, slope * found.level_std)
+    slope = result.smooth_bend.imag / result.smooth_rate.real
+    score = (result.rate.imag - true) / np.hypot(result.rate_std.imag, slope * result.level_std)
     assert true.max() / true.min() > 1.05
     assert np.mean(np.abs(score) < 1.96) > 0.85
     assert 0.4 < np.sqrt(np.mean(score**2)) < 1.6
     # Between the ends, where the filter sees both sides: 1 % of noise in some 300 samples.
-    np.testing.assert_allclose(found.rate.imag[2:-2], true[2:-2], rtol=1e-3)
+    np.testing.assert_allclose(result.rate.imag[2:-2], true[2:-2], rtol=1e-3)
 
 
 def test_what_lies_beside_the_mode_is_measured(mode):
     record = interfering(mode)
-    found = sj.measure.isolate_decay(TIME, record, REST)
+    result = sj.measure.isolate_decay(TIME, record, REST)
     centred = record - record.mean()
     np.testing.assert_allclose(
-        found.interfering.mode_fraction, np.sum(mode**2) / np.sum(centred**2), atol=0.02
+        result.interfering.mode_fraction, np.sum(mode**2) / np.sum(centred**2), atol=0.02
     )
-    assert found.interfering.frequency / HERTZ == pytest.approx(108, abs=1)
-    ((hertz, size),) = found.interfering.hum
+    assert result.interfering.frequency / HERTZ == pytest.approx(108, abs=1)
+    ((hertz, size),) = result.interfering.hum
     assert hertz == pytest.approx(60, abs=0.1)
     assert size == pytest.approx(0.01 * np.abs(mode).max(), rel=0.3)
 
 
 def test_a_mode_alone_passes_through(mode, backbone):
-    found = sj.measure.isolate_decay(TIME, mode, REST)
-    first = int(np.argmin(np.abs(TIME - found.time[0])))
-    away = found.velocity - mode[first : first + len(found.velocity)]
+    result = sj.measure.isolate_decay(TIME, mode, REST)
+    first = int(np.argmin(np.abs(TIME - result.time[0])))
+    away = result.velocity - mode[first : first + len(result.velocity)]
     assert np.sqrt(np.mean(away**2) / np.mean(mode**2)) < 2e-3
     # The decaying motion is slower than the undamped one by (D/2ω)²/2: 3e-6.
-    true = np.interp(np.exp(found.level.real), *backbone)
-    np.testing.assert_allclose(found.rate.imag[1:-1], true[1:-1], rtol=1e-4)
+    true = np.interp(np.exp(result.level.real), *backbone)
+    np.testing.assert_allclose(result.rate.imag[1:-1], true[1:-1], rtol=1e-4)
 
 
 @pytest.mark.parametrize("times", [0.9, 1.08])
@@ -99,14 +99,14 @@ def test_a_mode_inside_the_band_is_refused(mode, times):
 def test_the_decay_begins_where_the_mode_dominates(mode):
     """A neighbour, inside the band, that dies out in half a second."""
     other = tone(37.0, 0.5 * np.abs(mode).max(), 0.03)
-    found = sj.measure.isolate_decay(TIME, mode + other, REST)
-    assert 0.05 < found.begin < 1.0
+    result = sj.measure.isolate_decay(TIME, mode + other, REST)
+    assert 0.05 < result.begin < 1.0
 
 
 def test_records_without_the_mode_are_refused(mode):
     noise = np.random.default_rng(1).standard_normal(len(TIME))
     for record, words in (
-        (noise, "cannot be isolated|no mode that rings"),
+        (noise, "cannot be isolated|no decaying mode"),
         (np.where(TIME > 1, np.nan, mode), "NaN or inf"),
         (np.clip(mode, -0.2, 0.2), "it is clipped"),
     ):
@@ -125,6 +125,6 @@ def test_a_beat_whose_phase_runs_backwards_is_refused(capfd):
     one = np.exp(-0.0025 * omega * time) * np.cos(omega * time + 0.3)
     other = np.exp(-0.0011 * 0.89 * omega * time) * np.cos(0.89 * omega * time + 1.5)
     signal = one + 0.6 * other + 0.003 * rng.standard_normal(len(time))
-    with pytest.raises(ValueError, match="phase of its motion runs backwards"):
+    with pytest.raises(ValueError, match="its phase runs backwards"):
         sj.measure.isolate_decay(time, signal, omega)
     assert capfd.readouterr() == ("", "")

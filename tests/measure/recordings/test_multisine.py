@@ -19,7 +19,7 @@ def multisine(seed, amplitude=1.0):
 
 
 def through(signal, squared=0.0, cubed=0.0):
-    """A linear filter with an exact circular answer, and a static nonlinearity beside it."""
+    """A linear filter with an exact circular answer, and a additional static nonlinearity."""
     k = np.arange(SAMPLES // 2 + 1)
     gain = 1 / (1 - (k / 90.0) ** 2 + 0.06j * k / 90.0)
     linear = np.fft.irfft(np.fft.rfft(signal) * gain, SAMPLES)
@@ -35,12 +35,12 @@ def recorded(force, motion, noise=0.0, seed=0):
 def test_a_linear_system_is_found_with_its_period_and_lines():
     force = multisine(1)
     motion, gain = through(force)
-    found = sj.measure.multisine_responses(recorded(force, motion), "F", ["x"])
-    assert found.period == SAMPLES / RATE
-    assert found.periods == PERIODS - 1
-    np.testing.assert_allclose(found.responses.frequency, LINES * HERTZ * RATE / SAMPLES)
-    np.testing.assert_allclose(found.responses.values[0, 0], gain[LINES], rtol=1e-9)
-    assert np.isnan(found.total_std).all()
+    result = sj.measure.multisine_responses(recorded(force, motion), "F", ["x"])
+    assert result.period == SAMPLES / RATE
+    assert result.periods == PERIODS - 1
+    np.testing.assert_allclose(result.responses.frequency, LINES * HERTZ * RATE / SAMPLES)
+    np.testing.assert_allclose(result.responses.values[0, 0], gain[LINES], rtol=1e-9)
+    assert np.isnan(result.total_std).all()
 
 
 def test_noise_is_told_from_nonlinear_scatter():
@@ -52,18 +52,18 @@ def test_noise_is_told_from_nonlinear_scatter():
         motion, gain = through(force, squared, cubed)
         records.append(recorded(force, motion, noise, seed))
         forces.append(force)
-    found = sj.measure.multisine_responses(records, "F", ["x"])
+    result = sj.measure.multisine_responses(records, "F", ["x"])
     expected = gain[LINES] + 3 * cubed * np.var(forces)
-    error = found.responses.values[0, 0] - expected
+    error = result.responses.values[0, 0] - expected
     # Realisations scatter about the linear approximation; a finite number of lines leaves 1/lines.
-    score = np.abs(error) / found.total_std[0]
+    score = np.abs(error) / result.total_std[0]
     assert 0.7 < np.sqrt(np.mean(score**2)) < 1.4
     # Noise alone: so many periods of so many realisations, of both channels.
     floor = noise * np.sqrt(4 / SAMPLES / (PERIODS - 1) / 16)
     np.testing.assert_allclose(
-        np.sqrt(np.mean(found.noise_std[0] ** 2 / (1 + np.abs(gain[LINES]) ** 2))), floor, rtol=0.1
+        np.sqrt(np.mean(result.noise_std[0] ** 2 / (1 + np.abs(gain[LINES]) ** 2))), floor, rtol=0.1
     )
-    assert "nonlinear scatter" in repr(found)
+    assert "nonlinear scatter" in repr(result)
 
 
 def test_noise_errors_cover_the_truth():
@@ -71,15 +71,15 @@ def test_noise_errors_cover_the_truth():
     motion, gain = through(force)
     scores = []
     for seed in range(50):
-        found = sj.measure.multisine_responses(
+        result = sj.measure.multisine_responses(
             recorded(force, motion, 0.1, seed),
             "F",
             ["x"],
             period=2.0,
             lines=LINES * HERTZ * RATE / SAMPLES,
         )
-        error = found.responses.values[0, 0] - gain[LINES]
-        scores += [*(error.real / found.noise_std[0]), *(error.imag / found.noise_std[0])]
+        error = result.responses.values[0, 0] - gain[LINES]
+        scores += [*(error.real / result.noise_std[0]), *(error.imag / result.noise_std[0])]
     # The rms of a complex error is √2 that of either part.
     assert 0.90 < np.mean(np.abs(scores) * np.sqrt(2) < 1.96) < 0.98
 
@@ -91,13 +91,13 @@ NOISE = time_recording(np.random.default_rng(1).standard_normal((2, 8192)), CHAN
 BAD = {
     "no channel": (GOOD, {"force": "load"}, "no channel 'load'"),
     "no responses": (GOOD, {"responses": []}, "name a force and other channels"),
-    "no period": (NOISE, {}, "no period is found"),
+    "no period": (NOISE, {}, "no period in channel"),
     "period between samples": (GOOD, {"period": 2.001}, "whole number of samples"),
     "one period": (GOOD, {"period": 2.0, "skip": 5}, "two periods are needed after the 5"),
     "skip": (GOOD, {"skip": -1}, "`skip` must be a whole number"),
     "lines between": (GOOD, {"lines": [HERTZ * 0.3]}, "multiples of 1/period"),
     "lines too high": (GOOD, {"lines": [HERTZ * 400]}, "between 0 and half"),
-    "no realisation": ((), {}, "one realisation at least"),
+    "no realisation": ((), {}, "at least one realisation"),
     "rates": (
         (GOOD, time_recording(np.ones((2, 64)), CHANNELS, 100.0)),
         {},
@@ -109,7 +109,7 @@ BAD = {
     ),
     "off the clock": (
         time_recording(np.tile(np.cos(np.arange(9000) / 9.13)[None], (2, 1)), CHANNELS, RATE),
-        *({}, "no whole number of samples"),
+        *({}, "not a whole number"),
     ),
     "dropouts": (
         time_recording(

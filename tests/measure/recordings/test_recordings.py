@@ -17,19 +17,19 @@ def record(samples=None, channels=(FORCE, MOTION), rate=100.0, **settings):
 
 
 def test_values_are_in_si_and_times_count_from_the_start():
-    found = record(start_time=3.0)
-    assert found.values(["acc"], 2, 4) == pytest.approx(9.80665 * np.array([[12.0, 13.0]]))
-    assert found.values()[0] == pytest.approx(1e3 * np.arange(10.0))
-    assert found.time(8, 99) == pytest.approx([3.08, 3.09])
-    assert found.duration == pytest.approx(0.1)
+    result = record(start_time=3.0)
+    assert result.values(["acc"], 2, 4) == pytest.approx(9.80665 * np.array([[12.0, 13.0]]))
+    assert result.values()[0] == pytest.approx(1e3 * np.arange(10.0))
+    assert result.time(8, 99) == pytest.approx([3.08, 3.09])
+    assert result.duration == pytest.approx(0.1)
 
 
 def test_blocks_join_to_the_whole_record():
-    found = record()
-    blocks = list(found.blocks(4, ["cell"], overlap=1))
+    result = record()
+    blocks = list(result.blocks(4, ["cell"], overlap=1))
     assert [one.start for one in blocks] == [0, 3, 6]
     joined = np.concatenate([blocks[0].values, *(one.values[:, 1:] for one in blocks[1:])], axis=1)
-    np.testing.assert_array_equal(joined, found.values(["cell"]))
+    np.testing.assert_array_equal(joined, result.values(["cell"]))
 
 
 def test_integers_of_a_memory_map_are_read_as_numbers_of_their_channels(tmp_path):
@@ -40,7 +40,7 @@ def test_integers_of_a_memory_map_are_read_as_numbers_of_their_channels(tmp_path
 
 def test_a_stretch_that_is_too_large_is_refused(tmp_path):
     huge = np.lib.stride_tricks.as_strided(np.zeros(1), (2, 2**25), (0, 0))
-    with pytest.raises(ValueError, match="too many to hold at once"):
+    with pytest.raises(ValueError, match="too many for memory"):
         record(huge).values()
     assert record(huge).values(stop=3).shape == (2, 3)
 
@@ -49,8 +49,8 @@ def test_a_stretch_that_is_too_large_is_refused(tmp_path):
     ("change", "message"),
     [
         ({"channels": ()}, "at least one channel"),
-        ({"channels": (FORCE, FORCE)}, "names of their own"),
-        ({"channels": (FORCE,)}, "one row a channel, 1, but has 2"),
+        ({"channels": (FORCE, FORCE)}, "distinct names"),
+        ({"channels": (FORCE,)}, "one row per channel, 1, but has 2"),
         ({"channels": (FORCE, Channel("x", "speed"))}, "must be one of force"),
         ({"channels": (FORCE, Channel("x", calibration=0.0))}, "calibration of channel x"),
         ({"samples": np.zeros((2, 0))}, "needs samples"),
@@ -78,11 +78,11 @@ def responses(frequency=(1.0, 2.0), values=None, **settings):
 
 
 def test_responses_are_in_si_and_become_receptances():
-    found = responses()
-    assert found.values[0, 0] == pytest.approx(9.80665e-3 * np.array([1.0, -4.0]))
+    result = responses()
+    assert result.values[0, 0] == pytest.approx(9.80665e-3 * np.array([1.0, -4.0]))
     # −ω² x = a
-    assert found.receptance()[0, 0] == pytest.approx(9.80665e-3 * np.array([-1.0, 1.0]))
-    assert found.to_xarray()["value_re"].sizes == {
+    assert result.receptance()[0, 0] == pytest.approx(9.80665e-3 * np.array([-1.0, 1.0]))
+    assert result.to_xarray()["value_re"].sizes == {
         "response": 1,
         "reference": 1,
         "frequency_hz": 2,

@@ -1,4 +1,4 @@
-"""Ring-downs found in a record, against the oscillator that rang."""
+"""Ring-downs detected in a record, against the simulated oscillator."""
 
 import numpy as np
 import pytest
@@ -33,11 +33,11 @@ def record(kind="velocity", noise=1e-3, drive="voltage", seed=0):
 
 
 def test_the_free_part_begins_where_the_drive_ends():
-    found = sj.measure.find_ring_downs(record(), "drive", "CH0")
-    assert [abs(one.start - wanted) <= 25 for one, wanted in zip(found, (2000, 8000), strict=True)]
-    assert found[0].stop == pytest.approx(6000, abs=150)
-    assert found[1].stop == len(TIME)
-    assert found[0].frequency == pytest.approx(REST, rel=1e-2)
+    result = sj.measure.find_ring_downs(record(), "drive", "CH0")
+    assert [abs(one.start - wanted) <= 25 for one, wanted in zip(result, (2000, 8000), strict=True)]
+    assert result[0].stop == pytest.approx(6000, abs=150)
+    assert result[1].stop == len(TIME)
+    assert result[0].frequency == pytest.approx(REST, rel=1e-2)
 
 
 STEADY = time_recording(
@@ -50,7 +50,7 @@ BAD = {
     "no drive": (STEADY, {"drive": "generator"}, "no channel 'generator'"),
     "nothing rings": (
         time_recording(np.zeros((2, 500)), STEADY.channels, RATE),
-        *({}, "nothing that rings down"),
+        *({}, "there is no free decay"),
     ),
     "quiet": (STEADY, {"quiet": 2.0}, "`quiet` must be between"),
 }

@@ -53,8 +53,8 @@ def test_steps_up_and_down_at_two_levels_are_found_and_settled():
     forces = np.repeat([1.0, 2.5], 10)
     values, truth = stepped(frequencies, forces, 5.0, jump=np.random.default_rng(3))
     # The same motion as displacement, velocity and acceleration of three channels.
-    found = sj.measure.stepped_sine_states(recorded(values), "CH1", ["CH2"], sensors=["tip"])
-    states = found.states
+    result = sj.measure.stepped_sine_states(recorded(values), "CH1", ["CH2"], sensors=["tip"])
+    states = result.states
     assert states.sensors == ("tip",)
     assert states.n_states == len(frequencies)
     np.testing.assert_allclose(np.asarray(states.frequency), HERTZ * frequencies, rtol=1e-6)
@@ -64,9 +64,9 @@ def test_steps_up_and_down_at_two_levels_are_found_and_settled():
     error = np.abs(np.asarray(states.velocity)[:, 0] / truth - 1)
     assert error.max() < 2e-3
     assert np.all(np.diff(np.asarray(states.order)) > 0)
-    assert "20 steps" in repr(found)
+    assert "20 steps" in repr(result)
     # A transient's decay time is the mode's, 1/(ζω).
-    seen = found.decay_time[np.isfinite(found.decay_time)]
+    seen = result.decay_time[np.isfinite(result.decay_time)]
     assert abs(np.median(seen) * RATIO * REST - 1) < 0.05
 
 
@@ -106,11 +106,11 @@ def test_stated_errors_cover_the_truth(colour, dwell):
     for seed in range(60):
         noise = np.random.default_rng(seed).standard_normal((2, values.shape[1] + 500))
         noise = lfilter([0.05], [1, -colour], noise, axis=1)[:, 500:]
-        found = sj.measure.stepped_sine_states(
+        result = sj.measure.stepped_sine_states(
             recorded(values + noise), "CH1", ["CH2"], frequencies=table, settle=0.0
         )
-        states = found.states
-        ratio = np.asarray(states.velocity)[:, 0] / (1e3 * truth[found.state >= 0])
+        states = result.states
+        ratio = np.asarray(states.velocity)[:, 0] / (1e3 * truth[result.state >= 0])
         size = np.abs(ratio) - 1
         relative = np.asarray(states.velocity_std)[:, 0] / np.abs(np.asarray(states.velocity)[:, 0])
         inside += [*(np.abs(size) < 1.96 * relative)]
@@ -130,13 +130,13 @@ def test_unsettled_short_clipped_and_missing_steps_are_stated():
     table[3] = (15.0, 15.2, table[3][2])
     table[4] = (20.0, 20.5, table[4][2])
     table[5] = (25.0, 30.0, table[5][2] * 1.02)
-    found = sj.measure.stepped_sine_states(recorded(values), "CH1", ["CH2"], frequencies=table)
-    names = found.variables()["status"].values.tolist()
+    result = sj.measure.stepped_sine_states(recorded(values), "CH1", ["CH2"], frequencies=table)
+    names = result.variables()["status"].values.tolist()
     assert names == [
         *("settled", "not_finite", "clipped", "too_short", "unsettled", "not_found"),
     ]
-    assert found.states.n_states == 1
-    assert "it is clipped" in repr(found)
+    assert result.states.n_states == 1
+    assert "it is clipped" in repr(result)
 
 
 def test_a_force_that_drops_at_resonance_gives_levels_by_drive_or_by_runs():
@@ -164,21 +164,21 @@ SWEEP = np.cos(HERTZ * (30 * np.arange(8000) / RATE + 5 * (np.arange(8000) / RAT
 NOISE = np.random.default_rng(0).standard_normal(6000)
 BAD = {
     "no force channel": (GOOD, {"force": "load"}, "force channel is missing.*no channel 'load'"),
-    "no response": (GOOD, {"responses": []}, "`responses` must name one channel"),
+    "no response": (GOOD, {"responses": []}, "`responses` must name at least one channel"),
     "unknown response": (GOOD, {"responses": ["tip"]}, "response channel is missing"),
     "force twice": (GOOD, {"responses": ["CH2", "CH2"]}, "named once"),
     "force is motion": (GOOD, {"force": "CH2", "responses": ["CH2"]}, "must be a force"),
     "response is force": (GOOD, {"responses": ["CH1"]}, "must be a displacement"),
     "no drive": (GOOD, {"drive": "generator"}, "drive channel is missing"),
     "sensors": (GOOD, {"sensors": ["a", "b"]}, "`sensors` must name each of the 1"),
-    "rate": (tones(900.0, 950.0), {}, "holds no tone"),
+    "rate": (tones(900.0, 950.0), {}, "has no tone"),
     "rate of a table": (
         *(GOOD, {"frequencies": [(0, 1, HERTZ * 600)]}),
-        "4 samples a cycle, but channel CH1 has 3.33",
+        "4 samples per cycle, but channel CH1 has 3.33",
     ),
     "no steps": (SWEEP, {}, "the record has no steps"),
-    "no tone": (NOISE, {}, "does not stay at one frequency"),
-    "silence": (0 * NOISE, {}, "holds no tone"),
+    "no tone": (NOISE, {}, "does not dwell at one frequency"),
+    "silence": (0 * NOISE, {}, "has no tone"),
     "one step": (tones(40.0), {}, "one step only, of 40 Hz"),
     "all clipped": (np.clip(GOOD, -0.6, 0.6), {}, "none of the 2 steps.*clipped"),
     "dropouts": (
@@ -186,7 +186,7 @@ BAD = {
         "none of the 1 steps.*not finite",
     ),
     "table beyond": (GOOD, {"frequencies": [(1, 3, 251.0)]}, "row 0.*beyond the record"),
-    "table turned": (GOOD, {"frequencies": [(1, 0.5, 251.0)]}, "row 0.*must rise"),
+    "table turned": (GOOD, {"frequencies": [(1, 0.5, 251.0)]}, "row 0.*must have start"),
     "table of another shape": (GOOD, {"frequencies": [251.0, 260.0]}, "must have rows of start"),
     "table is empty": (GOOD, {"frequencies": []}, "must have rows of start"),
     "harmonics": (GOOD, {"harmonic_order": (1, 30)}, "harmonic 30 of 4.* Hz lies above half"),
@@ -227,14 +227,14 @@ def test_steps_are_found_in_noise_with_and_without_jumps_of_phase(hertz, dwell, 
         )
         values = np.cos(turn) + noise * rng.standard_normal((2, len(turn)))
         record = recorded(values, ("force", "velocity"), 5000.0)
-        found = sj.measure.stepped_sine_states(record, "CH1", ["CH2"])
-        off = np.abs(np.asarray(found.states.frequency)[:, None] / HERTZ - hertz)
+        result = sj.measure.stepped_sine_states(record, "CH1", ["CH2"])
+        off = np.abs(np.asarray(result.states.frequency)[:, None] / HERTZ - hertz)
         assert np.array_equal(np.unique(off.argmin(axis=1)), np.arange(len(hertz)))
         assert off.min(axis=1).max() < 0.04 / dwell
 
 
 @pytest.mark.parametrize(
-    ("noise", "words"), [(0.0, "does not stay at one frequency"), (0.1, "moves on within them")]
+    ("noise", "words"), [(0.0, "does not dwell at one frequency"), (0.1, "drifts within them")]
 )
 def test_a_sweep_is_no_steps_and_fine_noisy_steps_are_no_sweep(noise, words):
     """Straight lines of phase fit a sweep piece by piece; within each piece it moves on."""
@@ -247,9 +247,9 @@ def test_a_sweep_is_no_steps_and_fine_noisy_steps_are_no_sweep(noise, words):
         values = np.cos(turn) + noise * rng.normal(size=(2, len(turn)))
         record = recorded(values, rate=rate)
         if law is held:
-            found = sj.measure.stepped_sine_states(record, "CH1", ["CH2"])
+            result = sj.measure.stepped_sine_states(record, "CH1", ["CH2"])
             # Neighbours that noise joins are fewer: 24 to 25 of them, all at frequencies of steps.
-            assert len(found.status) >= 24
+            assert len(result.status) >= 24
         else:
             with pytest.raises(ValueError, match=rf"{words}.*a sweep\? `sweep_states`"):
                 sj.measure.stepped_sine_states(record, "CH1", ["CH2"])

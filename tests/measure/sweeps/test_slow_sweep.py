@@ -28,10 +28,10 @@ def answer(law, force, turn, time, start=(0.0, 0.0)):
         q, v = state
         return v, force * np.cos(turn(t)) - 2 * RATIO * REST * v - REST**2 * q - law(q, v)
 
-    found = solve_ivp(
+    result = solve_ivp(
         rate, (time[0], time[-1]), start, t_eval=time, rtol=1e-8, atol=1e-10, method="DOP853"
     )
-    return found.y
+    return result.y
 
 
 def chirp(first, last, seconds, *, logarithmic=False):
@@ -91,19 +91,19 @@ def steady(law, states, k):
 def test_swept_states_are_those_of_a_stepped_sine(name, first, last):
     """A bias of the sweep of several per cent is gone to 0.3 % where the motion is no jump."""
     record = recorded(swept(LAWS[name], first, last, 60.0))
-    found = sj.measure.sweep_states(record, "CH1", ["CH2"])
+    result = sj.measure.sweep_states(record, "CH1", ["CH2"])
     plain = sj.measure.sweep_states(record, "CH1", ["CH2"], correct=False)
-    assert found.corrected
-    size = np.abs(np.asarray(found.states.velocity)[:, 0])
+    assert result.corrected
+    size = np.abs(np.asarray(result.states.velocity)[:, 0])
     # Close to a jump no force holds the state for long: it is not what a stepped sine could do.
-    slow = np.abs(found.sweep_inertia_fraction) < (0.08 if name == "hardening" else 1.0)
+    slow = np.abs(result.sweep_inertia_fraction) < (0.08 if name == "hardening" else 1.0)
     loud = np.flatnonzero((size > 0.3 * size.max()) & slow)
     error, before = [], []
     for k in loud[:: max(1, len(loud) // 4)]:
         error.append(
-            abs(complex(found.states.velocity[k, 0]) / steady(LAWS[name], found.states, k) - 1)
+            abs(complex(result.states.velocity[k, 0]) / steady(LAWS[name], result.states, k) - 1)
         )
-        near = int(np.argmin(np.abs(plain.time - found.time[k])))
+        near = int(np.argmin(np.abs(plain.time - result.time[k])))
         before.append(
             abs(
                 complex(plain.states.velocity[near, 0]) / steady(LAWS[name], plain.states, near) - 1
@@ -112,24 +112,26 @@ def test_swept_states_are_those_of_a_stepped_sine(name, first, last):
     assert max(before) > 0.05 or name == "hardening"
     assert max(error) < 3e-3
     # The modal constant of 1 kg.
-    assert abs(found.balance.constant - 1) < 3 * found.balance.constant_std
+    assert abs(result.balance.constant - 1) < 3 * result.balance.constant_std
 
 
 def test_a_linear_sweep_in_exact_numbers_and_its_predicted_bias():
     record = recorded(linear(8.5, 12.0, 60.0, logarithmic=True))
     for channel in ("CH2", "CH3"):
-        found = sj.measure.sweep_states(record, "CH1", [channel])
-        omega = np.asarray(found.states.frequency)
+        result = sj.measure.sweep_states(record, "CH1", [channel])
+        omega = np.asarray(result.states.frequency)
         inside = (omega > HERTZ * 9.4) & (omega < HERTZ * 11.5)
         true = 1j * omega / (REST**2 - omega**2 + 2j * RATIO * REST * omega)
-        error = np.asarray(found.states.velocity)[:, 0] / np.asarray(found.states.force) / true - 1
+        error = (
+            np.asarray(result.states.velocity)[:, 0] / np.asarray(result.states.force) / true - 1
+        )
         assert np.abs(error[inside]).max() < 3e-4
         plain = sj.measure.sweep_states(record, "CH1", [channel], correct=False)
         omega = np.asarray(plain.states.frequency)
         size = np.abs(np.asarray(plain.states.velocity)[:, 0] / omega)
         top = int(np.argmax(size))
         a, b, c = np.polyfit(omega[top - 2 : top + 3] - omega[top], size[top - 2 : top + 3], 2)
-        bias = found.bias[0]
+        bias = result.bias[0]
         shift = omega[top] - b / (2 * a) - REST * np.sqrt(1 - 2 * RATIO**2)
         assert abs(shift / bias.frequency_shift - 1) < 0.05
         peak = (c - b**2 / (4 * a)) / (FORCE / (2 * RATIO * REST**2))
@@ -163,15 +165,15 @@ def test_stated_errors_of_a_sweep_cover_the_truth():
     for seed in range(50):
         noise = 0.01 * size * np.random.default_rng(seed).standard_normal(clean.shape)
         record = recorded(clean + noise)
-        found = sj.measure.sweep_states(record, "CH1", ["CH2"], frequencies=wanted).states
-        velocity, force = np.asarray(found.velocity)[:, 0], np.asarray(found.force)
+        result = sj.measure.sweep_states(record, "CH1", ["CH2"], frequencies=wanted).states
+        velocity, force = np.asarray(result.velocity)[:, 0], np.asarray(result.force)
         ratio = velocity / force / true
         spread = np.hypot(
-            np.asarray(found.velocity_std)[:, 0] / np.abs(velocity),
-            np.asarray(found.force_std) / force,
+            np.asarray(result.velocity_std)[:, 0] / np.abs(velocity),
+            np.asarray(result.force_std) / force,
         )
         inside += [*(np.abs(np.abs(ratio) - 1) < 1.96 * spread)]
-        inside += [*(np.abs(np.angle(ratio)) < 1.96 * np.asarray(found.phase_std)[:, 0])]
+        inside += [*(np.abs(np.angle(ratio)) < 1.96 * np.asarray(result.phase_std)[:, 0])]
     assert 0.90 < np.mean(inside) < 0.99
 
 
@@ -184,7 +186,7 @@ BAD = {
     "beyond": (CHIRP, {"frequencies": [HERTZ * 30]}, "must lie within the sweeps, .*one is 30 Hz"),
     "negative": (CHIRP, {"frequencies": [-1.0]}, r"`frequencies` \(rad/s\) must be positive"),
     "missing": (np.where(TIME < 19, CHIRP, np.nan), {"force": "load"}, "force channel is missing"),
-    "rate": (CHIRP, {"harmonic_order": (1, 40)}, "needs 4 samples a cycle"),
+    "rate": (CHIRP, {"harmonic_order": (1, 40)}, "needs 4 samples per cycle"),
     "clipped": (np.clip(CHIRP, -0.5, 0.5), {"frequencies": [HERTZ * 12]}, "it is clipped"),
     "dropouts": (
         *(np.where(np.abs(TIME - 10) < 0.2, np.nan, CHIRP), {"frequencies": [HERTZ * 12]}),

@@ -10,9 +10,9 @@ import snrmjax as sj
 def test_the_lowered_peak_is_that_of_the_published_fit(rate):
     """Lollock's fit to time integrations, 1 − exp(−2.86 η^−0.445), holds to about 1 %."""
     omega, ratio = 100.0, 0.01
-    found = sj.measure.sweep_bias(omega, ratio, rate * 2 / np.pi * (ratio * omega) ** 2)
-    assert abs(found.normalised_rate - rate) < 1e-9
-    assert abs(found.peak_ratio - (1 - np.exp(-2.86 * rate**-0.445))) < 0.01
+    result = sj.measure.sweep_bias(omega, ratio, rate * 2 / np.pi * (ratio * omega) ** 2)
+    assert abs(result.normalised_rate - rate) < 1e-9
+    assert abs(result.peak_ratio - (1 - np.exp(-2.86 * rate**-0.445))) < 0.01
 
 
 def test_slow_sweeps_are_shifted_in_proportion_and_down_as_up():

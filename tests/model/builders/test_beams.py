@@ -99,10 +99,10 @@ def test_curved_beam_as_printed_is_bistable():
     # ω² q + α q² + β q³ = 0 by the quadratic formula, and V by hand.
     w2, a, b = (64.78 * HZ) ** 2, -3.4380e9, 6.2183e12
     roots = [(-a - s * np.sqrt(a * a - 4 * b * w2)) / (2 * b) for s in (1, -1)]
-    for found, q in zip((saddle, well), roots, strict=True):
-        assert float(found.displacement[0]) == pytest.approx(q, rel=1e-10)
+    for result, q in zip((saddle, well), roots, strict=True):
+        assert float(result.displacement[0]) == pytest.approx(q, rel=1e-10)
         energy = w2 * q**2 / 2 + a * q**3 / 3 + b * q**4 / 4
-        assert found.energy == pytest.approx(energy, rel=1e-9)
+        assert result.energy == pytest.approx(energy, rel=1e-9)
 
 
 def test_curved_beam_made_monostable_has_one_equilibrium():

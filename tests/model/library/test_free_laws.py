@@ -125,9 +125,9 @@ def test_a_law_simulates_what_its_formula_does_in_time():
     frequency, speed = np.asarray(curve.frequency), np.asarray(curve.velocity)[:, 1, 0]
     for omega in (0.85, 0.95, 1.05):
         assert np.sum(np.diff(frequency > omega)) == 1  # one motion there
-        found = np.interp(omega, frequency, np.abs(speed)) / omega
+        result = np.interp(omega, frequency, np.abs(speed)) / omega
         # The table is off by 2e-3 of the spring; the curve is drawn between points.
-        assert found == pytest.approx(abs(steady(spring, 0.036, omega)), rel=5e-3)
+        assert result == pytest.approx(abs(steady(spring, 0.036, omega)), rel=5e-3)
 
 
 @pytest.mark.parametrize("kind", LAWS)

@@ -74,7 +74,7 @@ def test_average_of_a_slider_follows_the_closed_formulas():
     n = 512
     average = averaged(slider(), jnp.asarray(AMPLITUDE), jnp.array(FREQUENCY), n_samples=n)
     wanted = 9.0 * slider_stiffness(1 / AMPLITUDE)
-    # A kink in the force: the square of the step, of the stuck stiffness.
+    # A corner in the force: the square of the step, of the stuck stiffness.
     step = (2 * np.pi / n) ** 2
     np.testing.assert_allclose(average.stiffness, wanted, rtol=0, atol=9 * step)
     wanted = 4 * 9.0 * np.maximum(AMPLITUDE - 1, 0) / (np.pi * FREQUENCY * AMPLITUDE**2)
@@ -141,9 +141,9 @@ def test_iwan_element_follows_masing(p):
     down = -2.0 * 1.7**p + 2 * 2.0 * ((1.7 - q) / 2) ** p
     up = 2.0 * 1.7**p - 2 * 2.0 * ((1.7 + q) / 2) ** p
     wanted = np.where(t <= np.pi, down, up)
-    # One kink among 48 points of Gauss's rule: the square of their distance, π/2/48.
+    # One corner among 48 points of Gauss's rule: the square of their distance, π/2/48.
     np.testing.assert_allclose(force, wanted, rtol=0, atol=2.0 * 1.7**p * (np.pi / 96) ** 2)
-    # At the tip there is no kink, but above p = 2 the thresholds w^(1/(p−1)) crowd towards 0.
+    # At the tip there is no corner, but above p = 2 the thresholds w^(1/(p−1)) crowd towards 0.
     assert float(force[0]) == pytest.approx(-2.0 * 1.7**p, rel=1e-12 if p <= 2 else 1e-5)
 
 
@@ -243,7 +243,7 @@ def test_rest_has_no_force_and_finite_derivatives(p):
         forward = jax.jvp(effect.cycle_force, (q, v), along)
         return forward, jax.grad(loss, argnums=(0, 1, 2))(effect, q, v)
 
-    for at in (0.0, 0.3):  # at rest, and held off it
+    for at in (0.0, 0.3):  # at rest, and displaced from it
         for leaf in jax.tree.leaves(evaluated(still + at, still)):
             np.testing.assert_array_equal(leaf, 0.0)
 

@@ -100,7 +100,7 @@ def _with(effect, name, value):
 
 
 def test_a_contact_needs_two_places_and_others_take_one():
-    with pytest.raises(ValueError, match="needs two places: `at`"):
+    with pytest.raises(ValueError, match="needs two attachments: `at`"):
         sj.model.make_effect("friction_contact", dict.fromkeys(contact().parameters(), 1.0), at="x")
     with pytest.raises(ValueError, match="takes no `normal_at`"):
         sj.model.make_effect("cubic_stiffness", {"coefficient": 1.0}, at="x", normal_at="y")

@@ -28,8 +28,8 @@ def terms_of(frequency, ratio, mass=(1.0, 1.0)):
     return np.asarray(mass), 2 * ratio * frequency, frequency**2
 
 
-def assert_same(found, wanted):
-    for part, other in zip(found, wanted, strict=True):
+def assert_same(result, wanted):
+    for part, other in zip(result, wanted, strict=True):
         np.testing.assert_allclose(part, other, rtol=4e-16)  # two roundings
 
 

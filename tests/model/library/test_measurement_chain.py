@@ -122,8 +122,8 @@ def test_instruments_of_one_kind_act_in_the_order_of_the_file():
     gain = make_effect("force_gain_error", {"gain": 0.25})
     offset = make_effect("force_offset_error", {"offset": 0.1})
     for order in ((gain, offset), (offset, gain)):
-        found = single(*order).measurement_effects
-        assert [e.kind for e in found] == [e.kind for e in order]
+        result = single(*order).measurement_effects
+        assert [e.kind for e in result] == [e.kind for e in order]
 
 
 def test_force_harmonics():

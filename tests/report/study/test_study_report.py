@@ -19,7 +19,7 @@ from snrmjax.report.study.study_report import (
 )
 from snrmjax.report.study.words import display_on_axis
 from snrmjax.study.analysis.digest import digest
-from snrmjax.study.analysis.failures import failure_fraction, failures_of, most_telling
+from snrmjax.study.analysis.failures import failure_fraction, failures_of, ranked_by_failure
 from snrmjax.study.analysis.outputs import Scalar, scalars, summarized
 
 NASTY = "<script>alert(1)</script>$x^2$"
@@ -133,7 +133,7 @@ def test_failures_are_placed(written):
     assert found.failures.counts == {"upper_end": 2 * N - n_failed, "step_too_small": n_failed}
     assert found.failures.failed_counts == {"step_too_small": n_failed}
     both = {"a": data_set()["a.b"].values, "b": b}
-    assert most_telling(both, found.failures.failed) == ["b", "a"]
+    assert ranked_by_failure(both, found.failures.failed) == ["b", "a"]
     fraction = failure_fraction(b, found.failures.failed)
     assert fraction.edges[8] == pytest.approx(0.8, abs=0.05)
     np.testing.assert_array_equal(fraction.fraction[[0, 3, 6, 9]], [0.0, 0.0, 0.0, 1.0])
@@ -158,7 +158,7 @@ def test_the_page_is_whole_and_escaped(written):
     assert page.count("data:image/png;base64,") == len(figures)
     sentence = study_sentence(found)
     n_failed = found.failures.n_failed
-    ended = f"{N} members, of which {n_failed} have no whole result: {n_failed} step_too_small."
+    ended = f"{N} members, of which {n_failed} have no complete result: {n_failed} step_too_small."
     assert sentence.startswith(ended)
     part = f"Peak velocity at 0.002 N of {N - n_failed} of {N} members: median 0.6"
     assert part in sentence

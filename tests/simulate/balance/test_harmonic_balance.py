@@ -39,7 +39,7 @@ MODERATE = {
     "iwan_microslip": {"coefficient": 0.9, "exponent": 1.6},
 }
 STRENGTHS = {"coefficient", "stiffness", "constant_force", "force"}
-# What changes the balance in another way than by a force.
+# Effects that change the balance other than by a force.
 OTHERS = {
     "added_mass": {"mass": 0.15},
     "linear_frequency_shift": {"relative_shift": -0.1},
@@ -59,7 +59,7 @@ def one_mode(potential=None, effects=(), omega=2.0, ratio=0.05, participation=1.
 
 
 def two_modes_with_effects(forces=tuple(MODERATE), others=()):
-    """All forces are there, those not named with strength zero: one shape, which compiles once."""
+    """With all forces, those not named at strength zero: one structure, compiled once."""
     modes = linear_modes([2.0, 5.0], [0.03, 0.01], [[1.0, 2.0]], [1.5, -0.5], mode_of_interest=1)
     effects = [
         make_effect(k, {n: v * (k in forces or n not in STRENGTHS) for n, v in p.items()})
@@ -77,7 +77,7 @@ def two_modes_with_effects(forces=tuple(MODERATE), others=()):
 
 @eqx.filter_jit
 def everything(balance, point, step):
-    """Residual and Jacobian, the same by automatic differentiation and by central differences."""
+    """Residual and Jacobian, also by automatic differentiation and by central differences."""
     shifts = step * jnp.eye(balance.size + 1)
     # One batch, hence one copy of the balance in the program.
     points = jnp.concatenate([point + shifts, point - shifts, point[None]])
@@ -92,13 +92,13 @@ def assert_exact_jacobian(balance):
     point[-1] = 1.1
     residual, jacobian, slow, automatic, slope = everything(balance, jnp.asarray(point), 1e-5)
     assert jacobian.shape == (balance.size, balance.size + 1)
-    size = float(jnp.abs(jacobian).max())
-    np.testing.assert_allclose(residual, slow, rtol=0, atol=1e-13 * size)
+    largest = float(jnp.abs(jacobian).max())
+    np.testing.assert_allclose(residual, slow, rtol=0, atol=1e-13 * largest)
     # The same sums in another order.
-    np.testing.assert_allclose(jacobian, automatic, rtol=0, atol=1e-12 * size)
+    np.testing.assert_allclose(jacobian, automatic, rtol=0, atol=1e-12 * largest)
     # A sixth of h² times the third derivative, 1e-10 of the largest entry, and rounding 1e-16/1e-5
     # of the residual's terms.
-    np.testing.assert_allclose(jacobian, slope, rtol=0, atol=1e-8 * size)
+    np.testing.assert_allclose(jacobian, slope, rtol=0, atol=1e-8 * largest)
     return jacobian
 
 
@@ -164,12 +164,12 @@ def test_linear_structure_is_solved_by_its_linear_response():
     velocity = velocity_phasors(exact, omega, modes.mode_shape)
     np.testing.assert_allclose(velocity[1], linear_response(modes, omega, force), rtol=1e-13)
     assert not np.any(velocity[2:])
-    # and by nothing else: the residual of another motion is its error through the stiffness.
+    # Sensitivity: the residual of another motion is its error times the stiffness.
     off = residual_of(balance, balance.point(1.001 * exact, omega))
     assert float(jnp.abs(off).max()) > 1e-4
 
 
-# Motions q = A cos Ωt + B and the forces they need, worked out by hand: the residual is
+# Motions q = A cos Ωt + B and the forces they need, derived by hand: the residual is
 # (left side − load)/(ω_ref² · scale), coefficients (mean, c1, s1, c2, s2, c3, s3).
 A, OMEGA, W, ZETA, LOAD = 0.8, 1.7, 2.0, 0.05, 1.5 * 0.9
 LINEAR = np.array([0, (W**2 - OMEGA**2) * A - LOAD, -2 * ZETA * W * OMEGA * A, 0, 0, 0, 0])
@@ -238,7 +238,7 @@ def test_samples_by_default_and_on_request():
     assert harmonic_balance(one_mode(), 1.0, 1.0, harmonic_order=3).n_samples == 16
     assert harmonic_balance(one_mode({"1111": 1.0}), 1.0, 1.0, harmonic_order=9).n_samples == 40
     effect = (make_effect("gap_stiffness", {"stiffness": 1.0, "gap": 1.0}),)
-    # The time of a kink is found between samples, by a cubic through four of them.
+    # Contact events are located between samples, by a cubic through four of them.
     assert harmonic_balance(one_mode({}, effect), 1.0, 1.0, harmonic_order=3).n_samples == 256
     effect = (make_effect("jenkins_slider", {"stiffness": 1.0, "slip_displacement": 1.0}),)
     assert harmonic_balance(one_mode({}, effect), 1.0, 1.0, harmonic_order=3).n_samples == 256
@@ -274,5 +274,5 @@ def test_resonance_displacement_solves_its_balance():
     assert resonance_displacement(one_mode(ratio=0.9), force) == pytest.approx(load / w**2)
     assert resonance_displacement(one_mode(ratio=0.0), force) <= 1.001e4 * load / w**2
     modes = linear_modes([2.0, 1.0], [0.01, 0.01], [[1.0, 1.0]], [0.0, 3.0])
-    # A force that leaves the mode of interest alone: P/2ζω² of the one that it moves.
+    # A force that does not drive the mode of interest: P/2ζω² of the mode that it drives.
     assert resonance_displacement(structure(modes), 2.0) == pytest.approx(300.0, rel=1e-3)

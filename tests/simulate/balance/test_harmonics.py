@@ -86,7 +86,7 @@ def test_polynomials_are_sampled_without_aliasing(order, degree):
     exact = coefficients(16 * n_samples)
     scale = np.abs(exact).max()
     np.testing.assert_allclose(coefficients(n_samples), exact, atol=ROUNDING * scale)
-    if degree >= 3:  # with (degree + 1)·order samples the highest harmonic folds on itself
+    if degree >= 3:  # with (degree + 1)·order samples the highest harmonic aliases onto itself
         wrong = coefficients((degree + 1) * order) - exact
         assert np.abs(wrong[-2:]).max() > 1e3 * ROUNDING * scale
 
@@ -103,7 +103,7 @@ def test_phasors_give_the_time_signal_at_the_sensors():
     phasors = velocity_phasors(jnp.asarray(x), jnp.asarray(omega), jnp.asarray(shape))
     v = (turning @ np.asarray(phasors)).real
     np.testing.assert_allclose(v, omega * np.stack(rate, axis=1) @ shape.T, atol=100 * ROUNDING)
-    assert not np.any(phasors[0])  # the mean does not move
+    assert not np.any(phasors[0])  # the mean has no velocity
 
     traces = []
 

@@ -15,7 +15,7 @@ from snrmjax.simulate.continuation.continuation import (
     trace_curve,
 )
 from snrmjax.simulate.continuation.event_location import EventSearch
-from snrmjax.simulate.continuation.newton import correct, solved_behind
+from snrmjax.simulate.continuation.newton import correct, solve_appended
 
 STEPS = StepControl()
 
@@ -38,7 +38,7 @@ def pole(point):
 
 
 def broken(point):
-    """x = λ, which turns into NaN beyond λ = 0.5."""
+    """x = λ, which becomes NaN beyond λ = 0.5."""
     x, lam = point
     bad = jnp.where(lam > 0.5, jnp.nan, 0.0)
     return jnp.array([x - lam + bad]), jnp.array([[1.0, -1.0]])
@@ -51,25 +51,25 @@ def nothing(point):
 
 
 def isola(point):
-    """A loop away from everything: an ellipse, x²/0.09 + (λ − 1)²/0.25 = 1."""
+    """An isolated loop: an ellipse, x²/0.09 + (λ − 1)²/0.25 = 1."""
     x, lam = point
     value = x**2 / 0.09 + (lam - 1) ** 2 / 0.25 - 1
     return jnp.array([value]), jnp.array([[2 * x / 0.09, 2 * (lam - 1) / 0.25]])
 
 
-def nonsmooth_point(point):
-    """x = ½|λ − 0.3|: the tangent turns by 2 atan ½ at once."""
+def corner(point):
+    """x = ½|λ − 0.3|: a corner, at which the tangent rotates by 2 atan ½."""
     x, lam = point
     side = jnp.where(lam > 0.3, 0.5, -0.5)
     return jnp.array([x - side * (lam - 0.3)]), jnp.stack([jnp.ones(()), -side])[None]
 
 
-PROBLEMS = (s_curve, circle, pole, broken, nothing, isola, nonsmooth_point)
+PROBLEMS = (s_curve, circle, pole, broken, nothing, isola, corner)
 
 
 @jax.jit
 def compiled(which, start, direction, within, across, steps):
-    """All problems in one: which of them is a number, so that this compiles once."""
+    """All problems in one program, selected by a number, so that it compiles once."""
 
     def problem(point):
         return jax.lax.switch(which, PROBLEMS, point)
@@ -96,7 +96,7 @@ def followed(
     followed.n_solves = int(curve.n_solves)
     assert np.all(np.isfinite(curve.points[:n]))
     assert np.all(np.isfinite(curve.tangents[:n]))
-    assert np.all(np.isnan(curve.points[n:]))  # nothing plausible behind the last point
+    assert np.all(np.isnan(curve.points[n:]))  # NaN after the last point
     return (
         np.asarray(curve.points)[:n],
         np.asarray(curve.tangents)[:n],
@@ -113,10 +113,10 @@ def test_points_lie_on_the_curve_and_tangents_along_it(s_points):
     points, tangents, status = s_points
     assert status == CurveStatus.UPPER_END
     x, lam = points.T
-    # Newton's method ends when the error that is left is below the tolerance.
+    # Newton's method ends when the remaining error is below the tolerance.
     np.testing.assert_allclose(x**3 - x, lam, atol=5 * STEPS.tolerance)  # slopes up to 5
     np.testing.assert_allclose(np.linalg.norm(tangents, axis=1), 1.0, rtol=1e-14)
-    # One Newton step older than the point: late by up to the root of 1e-9 times λ'' = 9.
+    # From the previous Newton iterate: off by up to the root of 1e-9 times λ'' = 9.
     exact = np.stack([np.ones_like(x), 3 * x**2 - 1], axis=1)
     exact /= np.linalg.norm(exact, axis=1, keepdims=True)
     np.testing.assert_allclose(tangents, exact, atol=1e-3)
@@ -135,10 +135,10 @@ def test_ends_lie_on_the_ends_of_the_range(s_points):
 
 def test_steps_keep_to_their_limits(s_points):
     points, tangents, _ = s_points
-    turn = np.arccos(np.clip(np.sum(tangents[1:] * tangents[:-1], axis=1), -1, 1))
-    assert turn.max() < 3 * STEPS.angle
+    rotation = np.arccos(np.clip(np.sum(tangents[1:] * tangents[:-1], axis=1), -1, 1))
+    assert rotation.max() < 3 * STEPS.angle
     length = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    # A step is measured along the tangent; the chord is longer by at most 1/cos(turn).
+    # A step is measured along the tangent; the chord is longer by at most 1/cos(rotation).
     assert length.max() <= STEPS.largest / np.cos(3 * STEPS.angle)
     assert np.median(length) > 0.5 * STEPS.largest  # and the steps do grow to the largest
     # In order along the curve, both folds passed.
@@ -160,10 +160,10 @@ def test_folds_are_located(s_points, sign):
     found, tangent = search.last.point, search.last.tangent
     assert bool(search.resolved)
     assert not bool(search.missed)
-    # Newton to 1e-11; the tangent's share along λ is then 6x·δx/(3x²−1…) of that order.
+    # Newton to 1e-11; the tangent's component along λ is then 6x·δx/(3x²−1…) of that order.
     np.testing.assert_allclose(found, [fold, fold**3 - fold], atol=1e-10)
     assert abs(float(tangent[-1])) < 1e-10
-    # An event that is not there is not resolved, and not missed either.
+    # Without an event none is resolved and none is missed.
     search = located_fold(points[k + 5], tangents[k + 5], points[k + 6])
     assert not bool(search.resolved)
     assert not bool(search.missed)
@@ -207,7 +207,7 @@ def test_a_loop_is_followed_once(problem, start, direction, largest):
     np.testing.assert_allclose(np.hypot(x, lam), 1.0, atol=1e-8)
     angle = np.unwrap(np.arctan2(lam, x))
     way = np.sign(angle[1] - angle[0])
-    # Once around, every point once and in order, the last step no longer than the others.
+    # Once around, every point once and in sequence, the last step no longer than the others.
     assert angle[-1] - angle[0] == pytest.approx(way * 2 * np.pi, abs=1e-6)
     assert np.all(way * np.diff(angle) > 0)
     length = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -215,14 +215,14 @@ def test_a_loop_is_followed_once(problem, start, direction, largest):
     assert len(np.unique(points[:-1].round(9), axis=0)) == len(points) - 1
 
 
-def test_a_kink_is_passed():
-    points, tangents, status = followed(nonsmooth_point, [0.65, -1.0], ends=(-1.0, 1.5))
+def test_a_corner_is_passed():
+    points, tangents, status = followed(corner, [0.65, -1.0], ends=(-1.0, 1.5))
     assert status == CurveStatus.UPPER_END
     np.testing.assert_allclose(points[:, 0], 0.5 * np.abs(points[:, 1] - 0.3), atol=1e-9)
     assert np.all(np.diff(points[:, 1]) > 0)  # never back
-    # Only near the kink are the steps small, and they grow again behind it.
+    # Steps are small only near the corner, and grow again after it.
     near = np.abs(points[:, 1] - 0.3) < 0.02
-    assert np.min(np.abs(points[near, 1] - 0.3)) < STEPS.nonsmooth_point
+    assert np.min(np.abs(points[near, 1] - 0.3)) < STEPS.corner_step
     assert np.linalg.norm(np.diff(points[-5:-1], axis=0), axis=1).max() > 0.9 * STEPS.largest
     np.testing.assert_allclose(tangents[-1], np.array([0.5, 1.0]) / np.hypot(0.5, 1.0), atol=1e-9)
 
@@ -239,9 +239,9 @@ def test_tolerance_is_honoured_and_costs_solves():
         distance = np.abs(x**3 - x - lam) / np.hypot(3 * x**2 - 1, 1)
         errors.append(distance.max())
         solves.append(followed.n_solves / len(points))
-        # The error that is left is judged by how far the last step reduced the residual.
+        # The remaining error is estimated from the reduction of the residual in the last step.
         assert errors[-1] <= 2 * tolerance
-    assert errors[0] > 1e-9  # nothing is done for nothing
+    assert errors[0] > 1e-9  # no superfluous solves
     assert solves[0] < solves[1] < solves[2] < solves[3]
 
 
@@ -258,7 +258,7 @@ def test_solves_are_counted():
 
     curve = run(jnp.array([-0.8, -0.6]))
     jax.effects_barrier()
-    # Each factorisation has its matrix, and the residual after the step that it gave.
+    # Each factorisation evaluates the matrix, and the residual after its step.
     assert len(calls) == 2 * int(curve.n_solves)
     assert int(curve.n_solves) >= int(curve.n_points) > 50
 
@@ -308,7 +308,7 @@ def test_a_curve_has_two_points(max_points):
 # ----------------------------------------------------------------------------------- correction
 
 
-def test_correction_stays_in_its_plane_and_says_when_it_fails():
+def test_correction_stays_in_its_plane_and_reports_failure():
     start, across = jnp.array([-0.7, 0.9]), jnp.array([0.6, 0.8])
     found = correct(circle, start, across, 1e-8, 20)
     point = found.point
@@ -318,7 +318,7 @@ def test_correction_stays_in_its_plane_and_says_when_it_fails():
     exact = 0.3 * np.array([0.6, 0.8]) + np.sqrt(1 - 0.3**2) * np.array([-0.8, 0.6])
     np.testing.assert_allclose(point, exact, rtol=0, atol=1e-8)  # the tolerance asked for
     assert float(across @ (point - start)) == pytest.approx(0.0, abs=1e-14)
-    # The tangent is one iterate older: late by the root of the tolerance.
+    # The tangent is that of the previous iterate: off by the root of the tolerance.
     assert float(found.tangent @ point) == pytest.approx(0.0, abs=1e-4)
     assert float(found.tangent @ across) > 0
     converged = correct(circle, start, across, 1e-8, 2).converged  # too few iterations
@@ -330,15 +330,15 @@ def test_correction_stays_in_its_plane_and_says_when_it_fails():
     assert not bool(converged)
 
 
-def test_matrices_side_by_side_are_factorised_one_by_one():
-    # Factorised together they may wait for each other for ever in two threads (jaxlib 0.10).
+def test_batched_matrices_are_factorised_one_by_one():
+    # Batched factorisations may deadlock in two threads (jaxlib 0.10).
     matrices = np.random.default_rng(0).normal(size=(3, 5, 7))
     columns = np.swapaxes(matrices, 1, 2)
-    found = jax.vmap(solved_behind)(columns)
+    found = jax.vmap(solve_appended)(columns)
     exact = np.linalg.solve(matrices[:, :, :5], matrices[:, :, 5:])
     np.testing.assert_allclose(np.swapaxes(found, 1, 2), exact, rtol=1e-12, atol=1e-13)
-    # Within another program's lanes too.
-    together = jax.vmap(solved_behind)
+    # Under a further `vmap` too.
+    together = jax.vmap(solve_appended)
     for solve, given in ((together, columns), (jax.vmap(together), columns[None])):
         program = str(jax.make_jaxpr(solve)(given))
         sizes = re.findall(r"f64\[([\d,]+)\] \w+:i32\[[\d,]+\] \w+:i32\[[\d,]+\] = lu", program)

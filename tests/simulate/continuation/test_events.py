@@ -1,4 +1,4 @@
-"""Folds, peaks, resonances and bifurcations against a balance and period maps from outside."""
+"""Folds, peaks, resonances and bifurcations against an independent balance and period maps."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from snrmjax.simulate.continuation.events import EVENT_KINDS
 from snrmjax.simulate.solutions.forced_response import forced_response
 
 HZ = 2 * np.pi
-# How often each event comes along the curved beam's three responses from 20 to 150 Hz.
+# How often each event occurs along the curved beam's three responses from 20 to 150 Hz.
 CURVED = {"fold": (2, 4, 4), "peak": (1, 3, 2), "phase_resonance": (1, 1, 1)}
 
 
@@ -40,7 +40,7 @@ def counts(curve):
     return {kind: curve.at_events(kind).size for kind in EVENT_KINDS}
 
 
-def turns(values):
+def extrema(values):
     """Maxima and minima along a sequence of values."""
     rising = np.sign(np.diff(values))
     return int(np.sum(rising[1:] < rising[:-1])), int(np.sum(rising[1:] > rising[:-1]))
@@ -58,7 +58,7 @@ def curved_in_steps():
                 steps=in_steps(step),
                 stability=False,
             )
-            # The others come from rest and turn back at a superharmonic resonance.
+            # The others start from rest and fold back at a superharmonic resonance.
             if curve.status == CurveStatus.UPPER_END
         ]
         for step in (0.003, 0.02, 0.05, 0.15, 0.3)
@@ -77,18 +77,18 @@ def test_no_event_is_lost_in_steps_of_any_size(curved_in_steps):
                 found, exact = (c.frequency[c.at_events(kind)] for c in (curve, fine))
                 # Located to 1e-12 in the scaled unknowns, a peak by its tangent to 1e-6.
                 np.testing.assert_allclose(found, exact, rtol=1e-6, err_msg=f"{step}, {kind}")
-    # The numbers are right: in fine steps every turn of frequency and velocity can be counted.
+    # Counts of reference: in fine steps every extremum of frequency and velocity is resolved.
     for number, curve in enumerate(curves[0.003]):
         assert len(curve.frequency) > 1000
-        assert sum(turns(curve.frequency)) == CURVED["fold"][number]
-        assert turns(np.abs(curve.velocity[:, 1, 0]))[0] == CURVED["peak"][number]
+        assert sum(extrema(curve.frequency)) == CURVED["fold"][number]
+        assert extrema(np.abs(curve.velocity[:, 1, 0]))[0] == CURVED["peak"][number]
         x = curve.coefficients[:, :, 0]
         in_phase = np.sign(x[1:, 1]) != np.sign(x[:-1, 1])
         assert np.sum(in_phase & (x[1:, 2] > 0)) == CURVED["phase_resonance"][number]
 
 
 def assert_located(curve, model, numpy_balance):
-    """Every event of a curve where the balance from outside has it."""
+    """Every event of a curve agrees with the independent balance."""
     order = (curve.coefficients.shape[1] - 1) // 2
     balance = numpy_balance(model, curve.force, order, np.abs(curve.coefficients).max())
     seen = 0
@@ -114,7 +114,7 @@ def test_events_of_the_flat_beam_are_located(flat_curve, numpy_balance):
     model, curve = flat_curve
     assert counts(curve) == {"fold": 2, "peak": 1, "phase_resonance": 1}
     assert assert_located(curve, model, numpy_balance) == 4
-    assert sum(turns(curve.frequency)) == 2
+    assert sum(extrema(curve.frequency)) == 2
 
 
 # --------------------------------------------------------------------------------- near a cusp
@@ -136,7 +136,7 @@ def parts(amplitude, load):
 
 
 def exact_folds(load):
-    """Frequencies of the folds: the upper root turns, dm/dQ + (dr/dQ)/(2√r) = 0, times √r."""
+    """Frequencies of the folds: extrema of the upper root, dm/dQ + (dr/dQ)/(2√r) = 0, times √r."""
 
     def slope(amplitude):
         by_root = -HARDENING * amplitude * VISCOUS**2 - load**2 / amplitude**3
@@ -170,7 +170,7 @@ def test_two_close_folds_inside_one_step_are_found(above, step, cusp):
     load = cusp * (1 + above)
     wanted = np.sort(exact_folds(load))
     assert len(wanted) == (2 if above > 0 else 0)
-    for begin in (1.0, 1.1, 1.2, 1.3):  # the steps fall differently
+    for begin in (1.0, 1.1, 1.2, 1.3):  # different positions of the steps
         (curve,) = forced_response(
             *(duffing(), [load], begin, 4.0),
             harmonic_order=1,
@@ -179,7 +179,7 @@ def test_two_close_folds_inside_one_step_are_found(above, step, cusp):
         )
         folds = curve.at_events("fold")
         np.testing.assert_allclose(np.sort(curve.frequency[folds]), wanted, rtol=1e-9)
-        if 0 < above < 0.1:  # indeed between two points of the curve that was followed
+        if 0 < above < 0.1:  # indeed between two points of the traced curve
             assert np.ptp(wanted) < 1e-3
             assert abs(folds[1] - folds[0]) <= 8
 
@@ -188,13 +188,13 @@ def test_two_close_folds_inside_one_step_are_found(above, step, cusp):
 
 
 def coupled_by_a_square():
-    """A second mode at twice the first one's frequency: their energy goes to and fro."""
+    """A second mode at twice the first one's frequency: they exchange energy."""
     modes = linear_modes([2.0, 4.0], [0.01, 0.01], [[1.0, 0.0]], [1.0, 0.0])
     return structure(modes, polynomial_potential({"112": 0.5}, 2))
 
 
 def symmetric():
-    """The oscillator of `duffing` with the curved beam's names: both share what is compiled."""
+    """The oscillator of `duffing` with the curved beam's names: they share compiled programs."""
     beam = curved_beam()
     numbers = (
         *(beam.modes.natural_frequency, beam.modes.damping_ratio, beam.modes.mode_shape),
@@ -254,7 +254,7 @@ def test_bifurcations_lie_where_multipliers_cross(kind, numpy_balance, time_doma
         error = fraction * (frequencies[1] - frequencies[0]) / curve.frequency[k]
         assert abs(error) < 1e-6, (kind, k)
         assert abs(fraction) < 1  # and it is this crossing, not another one far away
-    # The stability changes there and at folds, and nowhere else.
+    # The stability changes only there and at folds.
     change = np.flatnonzero(curve.stability[1:] != curve.stability[:-1])
     labelled = np.concatenate([where, curve.at_events("fold")])
     assert all(np.min(np.abs(labelled - k)) <= 1 for k in change)
@@ -272,7 +272,7 @@ def test_folds_of_the_flat_beam_do_not_depend_on_the_steps():
         found.append(np.concatenate([curve.frequency[curve.at_events(k)] for k in EVENT_KINDS]))
     # Located to 1e-12 in the scaled unknowns, the peak by its tangent to 1e-6.
     np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-6)
-    assert sum(turns(curve.frequency)) == 2
+    assert sum(extrema(curve.frequency)) == 2
 
 
 def test_flat_beam_folds_at_all_forces_are_as_many_as_its_turns():
@@ -335,21 +335,23 @@ def test_a_bifurcation_that_is_not_located_is_named(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("place", "height", "number"),
+    ("position", "height", "number"),
     [
         (2.0 + 1e-8, 1.00001, 0),  # within the accuracy of the location
-        (2.4, 1.05, 0),  # a jump beside the fold: no pair is on the circle
-        (2.4, 1.0, 1),  # a pair passes the circle beside the fold
+        (2.4, 1.05, 0),  # a jump near the fold: no pair is on the circle
+        (2.4, 1.0, 1),  # a pair crosses the circle near the fold
     ],
 )
-def test_a_fold_with_a_crossing_at_one_place_is_one_event(place, height, number, monkeypatch):
+def test_a_fold_with_a_crossing_at_the_same_point_is_one_event(
+    position, height, number, monkeypatch
+):
     # A Neimark-Sacker point has a pair on the circle, a fold a real multiplier at +1.
     model = structure(linear_modes([1.0, 2.0], [0.1, 0.1], [[1.0, 1.0]], [1.0, 1.0]))
     balance = response_balances([model], np.array([1.0]), 1, None)
     along = np.eye(7)[-1]
 
     def multipliers_of(_, __, points):
-        behind = points[:, -1] - place
+        behind = points[:, -1] - position
         modulus = np.where(behind > 0, height, min(height, 2 - height)) + 0.01 * behind
         turn = np.exp(0.7j)
         fold = 1.0 + 0.01 * (points[:, -1] - 2.0)

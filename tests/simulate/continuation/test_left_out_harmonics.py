@@ -27,7 +27,7 @@ def motions():
     return stacked([balance]), points
 
 
-def test_a_hard_stop_has_motions_with_twice_the_harmonics_or_says_that_it_has_none():
+def test_a_hard_stop_has_motions_with_twice_the_harmonics_or_reports_that_it_has_none():
     balances, points = motions()
     assert len(points) > 20
     nowhere = 1e3 * np.random.default_rng(0).normal(size=(1, points.shape[1]))
@@ -45,7 +45,7 @@ def test_a_hard_stop_has_motions_with_twice_the_harmonics_or_says_that_it_has_no
         left = a + 2 * RATIO * OMEGA * v + OMEGA**2 * q + STOP * np.maximum(q - GAP, 0.0)
         left -= FORCE * np.cos(turn[:, 0])
         kept = np.fft.rfft(left)[: 2 * HARMONICS + 1] * 2 / FINE
-        # What the samples leave of the stop's onset; without further harmonics 1e3 N are left.
+        # Sampling error at the stop's onset; without further harmonics the residual is 1e3 N.
         assert np.abs(kept).max() < 4e-4 * FORCE
     known = stability_of(many_multipliers(balances, owner, every))
     assert (known[:-1] != Stability.NOT_COMPUTED).all()

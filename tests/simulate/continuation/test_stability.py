@@ -8,10 +8,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import mathieu_a, mathieu_b
 
+from snrmjax.model.attachment import between
 from snrmjax.model.builders.matrices import chain, from_matrices
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
-from snrmjax.model.places import between
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.stability import (
@@ -48,7 +48,7 @@ def test_linear_modes_have_their_decay_as_multipliers(distance_between):
     assert np.all(stability_of(found) == Stability.STABLE)
 
 
-def test_undamped_growth_and_decay_are_told_apart():
+def test_undamped_growth_and_decay_are_distinguished():
     frequency, at_rest = np.array([2.0]), jnp.zeros((1, 3, 1))
     for slope, stable in ((1e-4, True), (-1e-4, False)):
         # f = slope·q̇ as the linear part of a van der Pol effect is none: use the motion itself.
@@ -111,7 +111,7 @@ def test_mathieu_tongue_of_first_order_is_unstable_inside(shift, stable):
 
 
 def test_product_of_multipliers_is_the_mean_damping():
-    # Liouville: det = exp(−∮ 2ζω + ∂f/∂q̇ dt), whatever the stiffness does.
+    # Liouville: det = exp(−∮ 2ζω + ∂f/∂q̇ dt), whatever the stiffness.
     w, zeta, frequency, amplitude = 2.0, 0.05, 1.7, 0.8
     cases = {
         "van_der_pol_damping": lambda c: c * amplitude**2 / 2,
@@ -119,12 +119,12 @@ def test_product_of_multipliers_is_the_mean_damping():
         "quadratic_damping": lambda c: 2 * c * frequency * amplitude * 2 / np.pi,
     }
     for kind, mean in cases.items():
-        # All three are there, two of them with strength zero: one shape, which compiles once.
+        # With all three, two of them at strength zero: one structure, compiled once.
         effects = [make_effect(k, {"coefficient": 0.3 if k == kind else 0.0}) for k in cases]
         model = one_mode(w, zeta, {"1111": 0.2}, tuple(effects))
         found = floquet_multipliers(model, cosine([amplitude]), np.array([frequency]))
         wanted = np.exp(-(2 * zeta * w + mean(0.3)) * 2 * np.pi / frequency)
-        # Fourth order in 2π/256, and second order at the kinks of |q̇|: (2π/256)²/6.
+        # Fourth order in 2π/256, and second order at the corners of |q̇|: (2π/256)²/6.
         tolerance = 1e-4 if kind == "quadratic_damping" else 1e-6
         assert complex(found[0].prod()) == pytest.approx(wanted, rel=tolerance), kind
 
@@ -151,7 +151,7 @@ def test_multipliers_converge_with_their_power_of_the_step(effect, power, steps,
 
 
 def test_both_methods_give_the_same_multipliers(distance_between):
-    """A force of strength zero takes the general way, which is of another order."""
+    """A force of strength zero selects the general method, which has another order."""
     potential = {"1111": -0.6, "112": 0.2, "1122": 10.0, "2222": 3.0}
     modes = linear_modes([2.0, 9.0], [0.02, 0.01], [[1.0, 1.0]], [1.0, 0.3])
     nothing = make_effect("cubic_damping", {"coefficient": 0.0})
@@ -172,7 +172,7 @@ def test_both_methods_give_the_same_multipliers(distance_between):
 
 
 @pytest.mark.parametrize("coupled", [True, False])
-def test_many_modes_have_the_multipliers_of_the_general_way(coupled, distance_between):
+def test_many_modes_have_the_multipliers_of_the_general_method(coupled, distance_between):
     """Eight masses: matrices are multiplied whole, not term by term."""
     dampers = [0.05, *[0.0] * 7, 0.02] if coupled else 0.0
     matrices = chain([1.0] * 8, [1.0] * 9, dampers)
@@ -194,7 +194,7 @@ def test_many_modes_have_the_multipliers_of_the_general_way(coupled, distance_be
 def test_multipliers_with_coupled_damping_are_those_of_the_integrated_equations(
     heaviest, distance_between
 ):
-    """Three masses with cubic springs; a damper that swings all modes, or stops one of them."""
+    """Three masses with cubic springs; a damper that lets all modes oscillate, or overdamps one."""
     mass, damping, stiffness, names = chain(
         [1.0, 2.0, 0.5], [1.0, 2.0, 1.0, 0.0], [0.02, 0.0, heaviest, 0.0]
     )
@@ -245,7 +245,7 @@ def test_multipliers_along_a_response_are_those_of_the_integrated_map(
         truth = time_domain(model, curve.force, curve.frequency[k]).multipliers(
             state_of(curve.coefficients[k], curve.frequency[k])
         )
-        # Nine harmonics leave 7e-5 (flat) and 3e-3 (curved) of the motion out.
+        # With nine harmonics 7e-5 (flat) and 3e-3 (curved) of the motion are truncated.
         tolerance = 1e-3 if which == "flat" else 2e-2
         distance = distance_between(curve.multipliers[k], truth)
         assert distance < tolerance * max(np.abs(truth).max(), 1.0), k
@@ -259,7 +259,7 @@ def test_light_damping_is_not_lost(time_domain, state_of, distance_between):
     model = structure(modes, polynomial_potential({"1111": 0.05, "1122": 10.0}, 2))
     (curve,) = forced_response(model, [0.01], 1.6, 1.95, harmonic_order=5)
     period = 2 * np.pi / curve.frequency
-    # Liouville: their product is e^{−ΣcT}, c = 2ζω, whatever the stiffness does.
+    # Liouville: their product is e^{−ΣcT}, c = 2ζω, whatever the stiffness.
     product = np.prod(curve.multipliers, axis=1)
     np.testing.assert_allclose(product, np.exp(-2e-5 * w.sum() * period), rtol=1e-11)
     # Both pairs are complex here, the faster one within 1e-4 of the circle.
@@ -301,7 +301,7 @@ def marched(states, omega, cubic):
     ]
     stops = [event(lambda t, y, d: y[1], 0)]
     time, y, direction = 0.0, np.array(states), 0
-    if abs(y[0] - y[2]) >= SLIP:  # dragged from the start
+    if abs(y[0] - y[2]) >= SLIP:  # slipping from the start
         direction = 1 if y[0] > y[2] else -1
         y[2] = y[0] - direction * SLIP
         direction *= direction * y[1] > 0
@@ -331,7 +331,7 @@ def test_multipliers_with_a_slider_are_those_of_its_exact_march(
     found, converged = solve_at_frequency(model, jnp.array([LOAD]), jnp.array([omega]), guess)
     assert bool(converged[0])
     start = state_of(np.asarray(found)[0], omega)
-    y = np.append(start, start[0] - SLIP)  # a guess: dragged by a rising motion
+    y = np.append(start, start[0] - SLIP)  # a guess: slipping with rising motion
     for _ in range(6):  # shooting, with the map's slope by differences
         end = marched(y, omega, cubic)
         steps = 1e-6 * np.diag([1.0, 1.0, 1.0])
@@ -344,7 +344,7 @@ def test_multipliers_with_a_slider_are_those_of_its_exact_march(
     np.testing.assert_allclose(start, y[:2], rtol=0, atol=2e-3)
     multipliers = np.linalg.eigvals(tangent)
     ours = floquet_multipliers(model, found, np.array([omega]))[0]
-    # Slips begin and end between 512 samples: by straight lines and parabolas to (2π/512)²/8 of a
+    # Slip events are located between 512 samples by lines and parabolas, to (2π/512)²/8 of a
     # phase, across which the stiffness over ω² changes by 0.4, four times a period; the balance's
     # motion with 21 harmonics begins them later by as much again.
     assert distance_between(np.append(ours, 0.0), multipliers) < 2e-4
@@ -353,8 +353,8 @@ def test_multipliers_with_a_slider_are_those_of_its_exact_march(
     assert abs(np.prod(ours).real - viscous) > 0.05
 
 
-def test_pieces_between_slips_and_contacts_are_what_small_steps_make_of_them(distance_between):
-    """A damping of strength zero takes the general way; without it the structure is linear."""
+def test_intervals_between_events_agree_with_small_steps(distance_between):
+    """A damping of strength zero selects the general method; without it the structure is linear."""
     effects = [
         make_effect("jenkins_slider", {"stiffness": 2.0, "slip_displacement": 0.2}, at="x1"),
         make_effect(

@@ -1,4 +1,4 @@
-"""Multipliers of motions with friction and stops at several points, by an integration of our own.
+"""Multipliers of motions with friction and stops at several points, by an independent integration.
 
 The points are integrated by Runge and Kutta, sliders clipped after each step; the map over a
 period is differentiated by central differences, positions of the sliders included.
@@ -86,15 +86,15 @@ def test_multipliers_with_friction_and_a_stop_at_several_points(motion):
     np.testing.assert_allclose(end[:6].mean(axis=1), state[:6], rtol=2e-3, atol=2e-3 * abs(x).max())
     values = np.linalg.eigvals((end[:, :8] - end[:, 8:]) / (2 * size))
     values = values[np.argsort(-np.abs(values))]
-    assert np.all(np.abs(values[6:]) < 1e-9)  # sliders are set anew in every period
+    assert np.all(np.abs(values[6:]) < 1e-9)  # sliders are reset in every period
     wanted, ours = (np.sort(np.abs(row)) for row in (values[:6], found))
-    # Times of slip, from 512 samples, are late by up to 1e-4 of a period; ours of 4 000 steps too.
+    # Times of slip, from 512 samples, are off by up to 1e-4 of a period; those of 4 000 steps too.
     np.testing.assert_allclose(ours, wanted, rtol=0, atol=5e-4)
 
 
 @pytest.mark.long
 def test_a_multiplier_is_one_where_a_response_with_sliders_and_stops_turns():
-    # At a fold two motions meet, so that a disturbance from one to the other stays as it is.
+    # At a fold two motions meet, so that a disturbance from one to the other persists.
     elements = (
         ("jenkins_slider", "x1", {"stiffness": 0.1655, "slip_displacement": 0.4998}),
         (
@@ -116,5 +116,5 @@ def test_a_multiplier_is_one_where_a_response_with_sliders_and_stops_turns():
     assert len(folds) == 2
     for k in folds:
         # Of the nine harmonics alone the upper fold's is 0.96: a stable motion there. With twice
-        # as many they are right to the next ones' share, 1e-3.
+        # as many the error is that of the next ones, 1e-3.
         assert np.abs(curve.multipliers[k] - 1).min() < 3e-3

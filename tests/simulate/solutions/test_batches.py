@@ -1,4 +1,4 @@
-"""Batches of responses: each member as alone, failures apart, nothing compiled anew."""
+"""Batches of responses: each member as computed alone, failures isolated, no recompilation."""
 
 import equinox as eqx
 import jax
@@ -43,7 +43,7 @@ def assert_same_curve(one, other):
     assert one.status == other.status
     assert one.event == other.event
     assert one.n_solves == other.n_solves
-    # The same steps; a block of eight and a single curve are two programs, which round apart.
+    # The same steps; a block of eight and a single curve are two programs, with different rounding.
     np.testing.assert_allclose(one.frequency, other.frequency, rtol=1e-9)
     scale = np.abs(other.coefficients).max()
     np.testing.assert_allclose(one.coefficients, other.coefficients, rtol=0, atol=1e-8 * scale)
@@ -81,7 +81,7 @@ def test_members_that_fail_leave_the_others_untouched(batch):
     broken = eqx.tree_at(lambda m: m.modes.damping_ratio, models[1], jnp.array([jnp.nan]))
     models[1] = broken
     forces[[2, 3, 4, 5]] = 0.0, -1.0, np.nan, np.inf
-    forces[6] = 1e30  # Newton's method finds nothing
+    forces[6] = 1e30  # Newton's method fails
     mixed = forced_response_batch(models, forces, *RANGE, settings=SETTINGS)
     assert mixed.status[1:6].tolist() == [CurveStatus.INVALID] * 5
     assert mixed.status[6] == CurveStatus.NO_START
@@ -115,20 +115,20 @@ def test_other_numbers_and_more_members_compile_nothing(batch, compilations):
     assert more.status.tolist() == [CurveStatus.UPPER_END] * 19
     assert len(batch.status) == 11
     jax.jit(lambda x: jnp.sin(x) + 0.123)(1.0).block_until_ready()
-    assert len(compilations) > 0  # and the count does count
+    assert len(compilations) > 0  # the counter works
 
 
-def test_chunks_give_the_same_and_tell_their_progress(batch):
+def test_chunks_give_the_same_and_report_their_progress(batch):
     models, forces = members(11)
-    told = []
+    reported = []
     chunked = forced_response_batch(
         *(models, forces, *RANGE),
         settings=SETTINGS,
         chunk=4,
         keep_curves=False,
-        progress=lambda done, of: told.append((done, of)),
+        progress=lambda done, of: reported.append((done, of)),
     )
-    assert told == [(4, 11), (8, 11), (11, 11)]
+    assert reported == [(4, 11), (8, 11), (11, 11)]
     assert chunked.curves == ()
     np.testing.assert_array_equal(chunked.status, batch.status)
     np.testing.assert_array_equal(chunked.n_points, batch.n_points)
@@ -179,10 +179,10 @@ def test_models_are_stacked_and_taken_again():
 
 
 def test_jobs_keep_their_order_and_raise_their_errors():
-    told = []
-    found = over_cores(lambda k: k**2, range(7), progress=lambda *row: told.append(row))
+    reported = []
+    found = over_cores(lambda k: k**2, range(7), progress=lambda *row: reported.append(row))
     assert found == [k**2 for k in range(7)]
-    assert told == [(k, 7) for k in range(1, 8)]
+    assert reported == [(k, 7) for k in range(1, 8)]
 
     def job(k):
         if k == 3:

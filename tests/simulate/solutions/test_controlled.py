@@ -58,7 +58,7 @@ DAMPING = {
 @pytest.mark.parametrize("kind", DAMPING)
 def test_damping_of_an_effect_is_its_describing_function(kind):
     _, added, tolerance = DAMPING[kind]
-    # All are there, the others with strength zero: one shape, which compiles once.
+    # With all of them, the others at strength zero: one structure, compiled once.
     effects = tuple(
         make_effect(name, {k: v * (name == kind) for k, v in others.items()})
         for name, (others, _, _) in DAMPING.items()
@@ -67,14 +67,14 @@ def test_damping_of_an_effect_is_its_describing_function(kind):
     assert branch.status == CurveStatus.AMPLITUDE_LIMIT
     assert len(branch.frequency) > 20
     q = np.hypot(branch.coefficients[:, 1, 0], branch.coefficients[:, 2, 0])
-    # The extended motion obeys ω̃ = Ω (a single harmonic of q̈ + ω₀²q, nothing else in phase).
+    # The extended motion obeys ω̃ = Ω (a single harmonic of q̈ + ω₀²q, no other term in phase).
     np.testing.assert_allclose(branch.frequency, W, rtol=1e-8)
     wanted = (2 * ZETA * W + added(q, W)) / (2 * W)
     np.testing.assert_allclose(branch.damping_ratio, wanted, rtol=tolerance)
     assert np.ptp(wanted) > 0.1 * ZETA
 
 
-def test_a_slider_softens_and_damps_as_masing_says():
+def test_a_slider_softens_and_damps_by_masings_rule():
     stiffness, slip = 0.8, 0.2
     effect = make_effect("jenkins_slider", {"stiffness": stiffness, "slip_displacement": slip})
     branch = damped_normal_mode(one_mode({}, (effect,)), 3.0, harmonic_order=1, n_samples=1024)
@@ -112,11 +112,11 @@ def test_mass_proportional_damping_leaves_the_conservative_motion():
         assert second == pytest.approx(other, abs=1e-4 * abs(first))
         middle, half = 0.5 * (first + other), 0.5 * (first - other)
         at = middle + half * np.sin(0.5 * np.pi * node)
-        # U(q₀) − U(q) over (q₀ − q)(q − q₁), whose root the substitution takes away.
+        # U(q₀) − U(q) over (q₀ − q)(q − q₁), whose singularity the substitution removes.
         rest = (energy(first) - energy) // np.polynomial.Polynomial.fromroots([first, other])
         wanted.append(2 * np.pi / (np.pi * weight @ (1 / np.sqrt(-2 * rest(at)))))
     assert np.min(wanted) < 0.8 * np.sqrt(squared)
-    # Fifteen harmonics leave 1e-6 of the motion out at the largest amplitude.
+    # With fifteen harmonics 1e-6 of the motion is truncated at the largest amplitude.
     np.testing.assert_allclose(branch.frequency, wanted, rtol=1e-5)
 
 
@@ -173,7 +173,7 @@ def test_response_control_goes_through_states_of_the_open_loop(numpy_balance):
         point = np.append(curve.coefficients[k].ravel() / scale, curve.frequency[k] / balance.unit)
         exact = balance.solved(point, len(point) - 1)
         np.testing.assert_allclose(point, exact, rtol=0, atol=1e-7)
-    # The least force is that of the phase resonance: |F| = |V₁| over the mobility.
+    # The least force is at the phase resonance: |F| = |V₁| over the mobility.
     least = int(np.argmin(np.abs(curve.force)))
     (response,) = forced_response(
         model, [float(curve.force[least])], 60 * HZ, 110 * HZ, stability=False

@@ -1,4 +1,4 @@
-"""What drives a structure, masses without a linear spring: against integration of the matrices."""
+"""Kinds of excitation, and masses without a linear spring, against time integration."""
 
 import dataclasses
 
@@ -52,7 +52,7 @@ def read(folder, text):
 
 
 def miss_after_a_period(model, branch, point, matrices, force, inner):
-    """How far a motion is, over its size, from where the matrices bring it in a period."""
+    """Relative mismatch of a motion after time integration of the matrices over a period."""
     mass, damping, stiffness = matrices
     omega, x = branch.frequency[point], branch.coefficients[point]
     x = x @ np.asarray(model.modes.mode_shape).T
@@ -80,7 +80,7 @@ def test_an_unbalance_drives_by_the_square_of_the_frequency(tmp_path):
             UNBALANCE * curve.frequency[point] ** 2,
             lambda q: np.array([0.0, CUBIC * q[1] ** 3]),
         )
-        assert miss < 1e-5  # of the harmonics left out
+        assert miss < 1e-5  # by truncation
     # Twice the unbalance of the model is the model of twice the unbalance.
     (twice,) = sj.forced_response(model, [2.0], 14 * HERTZ, 15 * HERTZ, stability=False)
     other = read(tmp_path, ROTOR.replace(f"= {UNBALANCE}", f"= {2 * UNBALANCE}"))
@@ -123,7 +123,7 @@ def test_an_absorber_without_a_linear_spring(tmp_path):
         return np.array([-between, between])
 
     (curve,) = sj.forced_response(model, [2.0], 10 * HERTZ, 25 * HERTZ)
-    # Where the absorber takes the energy in, the resonance is modulated (Gendelman & Starosvetsky).
+    # Where the absorber takes up the energy, the response is modulated (Gendelman & Starosvetsky).
     assert curve.at_events("neimark_sacker").size == 2
     for point in range(3, len(curve.frequency), len(curve.frequency) // 5):
         matrices = mass, damping, stiffness
@@ -132,7 +132,7 @@ def test_an_absorber_without_a_linear_spring(tmp_path):
     matrices = mass, 0 * damping, stiffness
     middle = len(mode.frequency) // 2
     assert miss_after_a_period(model, mode, middle, matrices, 0.0, inner) < 1e-6
-    # As modes, where it is a rigid-body mode that the element holds.
+    # As modes: a rigid-body mode that the element restrains.
     write_model(tmp_path / "modes.toml", model)
     again = sj.read_model(tmp_path / "modes.toml").modes
     for name in ("natural_frequency", "mode_shape", "participation", "damping_coupling"):
@@ -154,11 +154,11 @@ def test_a_force_on_another_mode_than_that_of_interest(tmp_path):
     assert resonance == pytest.approx(peak, abs=2)
     # x = a = −b: ẍ + 2ẋ + 3·10⁴x + 8·5·10⁶x³ = 4 cos Ωt, at resonance 2 |ẋ| = 4 by one harmonic.
     assert speed.max() == pytest.approx(2.0, rel=2e-2)
-    with pytest.raises(ValueError, match="does not move"):
+    with pytest.raises(ValueError, match="does not drive"):
         sj.simulate.phase_controlled(model, 1.0)
     data = "level,sensor,frequency_hz,force_n,velocity_re_m_s,velocity_im_m_s\n1,a,15,1,0.01,0.02\n"
     (tmp_path / "data.csv").write_text(data)
-    with pytest.raises(ValueError, match="does not move"):
+    with pytest.raises(ValueError, match="does not excite"):
         sj.read_steady_states(tmp_path / "data.csv", model)
 
 

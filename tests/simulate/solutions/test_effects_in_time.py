@@ -1,6 +1,6 @@
-"""Every effect that makes a force: harmonic balance against integration in time from outside.
+"""Every effect that makes a force: harmonic balance against independent time integration.
 
-The equations of motion and the laws are written here again, in NumPy. Smooth and kinked forces
+The equations of motion and the laws are written here again, in NumPy. Smooth and nonsmooth forces
 are integrated by SciPy's Dormand-Prince of order 8, Coulomb's oscillator from one stop to the
 next in closed form, sliders marched in small steps with their exact return map.
 """
@@ -26,7 +26,7 @@ SIZE = STATIC / (2 * RATIO)  # kg^1/2 m, at resonance under 1 N
 SQUARED, VISCOUS = OMEGA**2, 2 * RATIO * OMEGA
 FREQUENCIES = np.array([0.97, 1.0, 1.03]) * OMEGA
 CYCLES = 64  # e^{−2π·0.03·64} = 6e-6 is left of the transient of a linear mode
-MORE_CYCLES = 160  # beside a fold, where transients last longer
+MORE_CYCLES = 160  # near a fold, where transients last longer
 SAMPLES = 256  # of the last cycle
 
 
@@ -69,9 +69,14 @@ def settled(
         own, ratio, coupling = added
         y, w = other
         r, s = SIZE * y, SIZE * omega * w
-        pull, back = coupling(q, r)
+        coupling_force, back = coupling(q, r)
         further = -2 * ratio * own * s - own**2 * r - back
-        rates = (u, (force - pull) / (mass * SIZE * omega**2), w, further / (SIZE * omega**2))
+        rates = (
+            u,
+            (force - coupling_force) / (mass * SIZE * omega**2),
+            w,
+            further / (SIZE * omega**2),
+        )
         return np.concatenate(rates)
 
     begin = np.zeros((2 if added is None else 4, n))
@@ -114,14 +119,14 @@ def coulomb_oscillator(friction, omega):
     samples = np.zeros(SAMPLES)
     time, q = 0.0, 0.0
     while time < end:
-        pull = PARTICIPATION * np.cos(omega * time) - SQUARED * q
-        assert abs(pull) > friction, "it sticks, which is not provided for here"
-        sign = np.sign(pull)
+        net_force = PARTICIPATION * np.cos(omega * time) - SQUARED * q
+        assert abs(net_force) > friction, "it sticks, which is not provided for here"
+        sign = np.sign(net_force)
         motion = piece(time, q, 0.0, sign)
         grid = time + period * np.arange(1, 200) / 200
-        turned = grid[np.argmax(sign * motion(grid)[1] < 0)]
+        reversal = grid[np.argmax(sign * motion(grid)[1] < 0)]
         stop = brentq(
-            lambda t, motion=motion: motion(t)[1], turned - period / 200, turned, xtol=1e-14
+            lambda t, motion=motion: motion(t)[1], reversal - period / 200, reversal, xtol=1e-14
         )
         here = (wanted >= time) & (wanted < stop)
         samples[here] = motion(wanted[here])[0]
@@ -160,10 +165,10 @@ def marched(stiffness, slip, omega, *, cycles=CYCLES, steps=512):
             before = q
             q = q + step * (v + 2 * v2 + 2 * v3 + v4) / 6
             new = v + step * (a1 + 2 * a2 + 2 * a3 + a4) / 6
-            # Where q turned within the step, the blocks went along to the turning point.
-            turned = v * new < 0
-            until = v / np.where(turned, v - new, 1.0)
-            blocks = moved(np.where(turned, before + 0.5 * step * until * v, before))
+            # Where q reversed within the step, the sliders moved with it up to the turning point.
+            reversed_ = v * new < 0
+            until = v / np.where(reversed_, v - new, 1.0)
+            blocks = moved(np.where(reversed_, before + 0.5 * step * until * v, before))
             blocks, v = moved(q), new
     return samples
 
@@ -211,8 +216,8 @@ COUPLED = {
         "damping_ratio": 0.02,
     },
 }
-GROUPS = {"smooth": SMOOTH, "kinked": NONSMOOTH, "friction": FRICTION, "coupled": COUPLED}
-# Effects that show at the fundamental only beside another one.
+GROUPS = {"smooth": SMOOTH, "nonsmooth": NONSMOOTH, "friction": FRICTION, "coupled": COUPLED}
+# Effects visible at the fundamental only together with another one.
 BESIDE = {
     "static_preload": {"cubic_stiffness": {"coefficient": 0.05 * CUBIC}},
     "force_harmonics": {
@@ -221,16 +226,17 @@ BESIDE = {
     },
 }
 ORDER = 0.6  # test order, for drift
-HARMONICS = {"smooth": 11, "kinked": 15, "friction": 15, "coupled": 11}
-# What separates the two, of the fundamental. Smooth laws: what SciPy's 1e-7 in a step adds up
-# to. Contacts: rounding over 2 % of half the range, which changes their stiffness by up to 1e-4.
-# Coulomb: smoothing takes 5.1e-4 of 4F/π. Sliders: turning points between 256 samples, 1e-4.
-TOLERANCE = {"smooth": 1e-5, "kinked": 1e-4, "friction": 1e-4, "coupled": 1e-5}
+HARMONICS = {"smooth": 11, "nonsmooth": 15, "friction": 15, "coupled": 11}
+# Difference of the two, relative to the fundamental. Smooth laws: SciPy's 1e-7 per step,
+# accumulated. Contacts: rounding over 2 % of half the range, which changes their stiffness by up
+# to 1e-4. Coulomb: smoothing takes 5.1e-4 of 4F/π. Sliders: turning points between 256 samples,
+# 1e-4.
+TOLERANCE = {"smooth": 1e-5, "nonsmooth": 1e-4, "friction": 1e-4, "coupled": 1e-5}
 COULOMB = 5e-4
 
 
 def law_of(kind, p):
-    """Force of a memoryless effect, from its definition in words."""
+    """Force of a memoryless effect, from its definition."""
     laws = {
         "cubic_stiffness": lambda q, v: p["coefficient"] * q**3,
         "quadratic_stiffness": lambda q, v: p["coefficient"] * q**2,
@@ -289,7 +295,7 @@ def truth(kind):
         FREQUENCIES,
         orders=orders,
         linear=linear_terms_of(kind, parameters),
-        # A kink in a step costs many: less is asked of it, as the tolerance allows.
+        # A corner within a step costs many steps: a coarser tolerance suffices here.
         **({"cycles": 104, "rtol": 1e-6} if kind in NONSMOOTH else {}),
     )
     return phasors(found[:, :, 0])
@@ -348,13 +354,13 @@ def test_harmonic_balance_is_the_settled_motion(group, kind):
     assert np.all(converged)
     found = as_phasors(coefficients)
     scale = np.abs(wanted[:, 1:2])
-    # The mean and the second and third harmonic to the same share of the fundamental.
+    # The mean and the second and third harmonic to the same fraction of the fundamental.
     np.testing.assert_allclose(found / scale, wanted / scale, atol=tolerance(group, kind))
-    # And the effect is no small one.
+    # The effect is not small.
     without, _ = balanced(model_with(group, kind, without=True), wanted, HARMONICS[group])
     change = np.abs(as_phasors(without)[:, 1] / wanted[:, 1] - 1)
     assert change.max() > 0.05
-    # What a motion settles to is stable.
+    # A settled motion is stable.
     multipliers = floquet_multipliers(simulated_structure(model), coefficients, FREQUENCIES)
     assert np.all(stability_of(multipliers) == Stability.STABLE)
 

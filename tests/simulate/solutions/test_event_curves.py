@@ -82,13 +82,13 @@ def test_curves_of_duffings_oscillator_are_exact(kind, parameter, to):
     condition = CONDITIONS[kind](d, s, c * omega)
     condition /= (np.abs(d) + s) ** 2 if kind == "fold" else 1.0
     np.testing.assert_allclose(condition, 0.0, atol=CORRECTED)
-    turns = curve.at_events("cusp")
+    cusps = curve.at_events("cusp")
     assert not any(name not in ("", "cusp") for name in curve.event)
     if kind == "phase_resonance":
-        assert not turns.size
+        assert not cusps.size
         assert curve.ends == (EventCurveEnd.LOWER_END, EventCurveEnd.UPPER_END)
         return
-    (k,) = turns
+    (k,) = cusps
     if parameter == "force":
         np.testing.assert_allclose((omega[k], curve.value[k]), cusp(C), rtol=1e-9)
         assert curve.ends == (EventCurveEnd.UPPER_END,) * 2
@@ -176,20 +176,20 @@ def singular(load, near):
 
 
 @pytest.mark.long
-def test_isola_and_main_response_merge_where_the_closed_form_says():
+def test_isola_and_main_response_merge_where_the_closed_form_has_it():
     model, unit = cantilever(), 0.1  # of ε, as the source has it
     exact = singular(cantilever_load, (0.026 / TIP, 7.0023))
     assert not exact[3]
     np.testing.assert_allclose(exact[2] / unit, 1.802e-3, atol=5e-7)
     np.testing.assert_allclose(TIP * exact[0], 0.0260, atol=5e-5)
-    # From the fold inside of the joined response down to where it turns.
+    # From the fold inside the joined response down to its turning point.
     start = event_of(model, 1.9e-3 * unit, (6.95, 7.05), "fold", number=1)
     folds = follow_event(model, 1.9e-3 * unit, start, kind="fold", to=(1e-5, 3e-4))
     (k,) = folds.at_events("isola_merging")
     found = displacement(folds)[k], folds.frequency[k], folds.value[k]
     np.testing.assert_allclose(found, exact[:3], rtol=1e-7)
     assert len(folds.at_events("cusp")) == 1
-    # The resonance turns back there too: what the response from rest can reach.
+    # The resonance has its turning point there too, the limit of the response from rest.
     for kind in ("phase_resonance", "peak"):
         start = event_of(model, 1e-4, (6.95, 7.05), kind)
         tips = follow_event(model, 1e-4, start, kind=kind, to=(1e-5, 3e-4))
@@ -215,7 +215,7 @@ def test_resonances_lead_to_the_isolated_response():
 
 
 @pytest.mark.long
-def test_an_isolated_response_begins_where_the_closed_form_says():
+def test_an_isolated_response_begins_where_the_closed_form_has_it():
     model, ends, fine = falling_damping(), (0.9, 1.2), 512
     birth = singular(falling_load, (0.757, 1.0086))
     merging = singular(falling_load, (0.435, 1.0028))
@@ -267,8 +267,8 @@ def test_phase_resonances_are_the_damped_backbone_and_lie_where_responses_have_t
         )
         assert again.value[0] == pytest.approx(force, rel=1e-12)
         assert again.frequency[0] == pytest.approx(located, rel=1e-8)
-    held = sj.simulate.phase_controlled(model, 0.02, harmonic_order=order)
-    at = np.interp(tips.force, held.force, held.frequency)
+    controlled = sj.simulate.phase_controlled(model, 0.02, harmonic_order=order)
+    at = np.interp(tips.force, controlled.force, controlled.frequency)
     # By lines between points of a curve that was traced for itself.
     np.testing.assert_allclose(tips.frequency, at, rtol=2e-4)
     mode = sj.nonlinear_normal_mode(model, 110 * HZ, harmonic_order=order, tongues="skip")
@@ -336,7 +336,7 @@ def test_further_modes_of_an_effect_are_followed():
 
 
 def coupled(*effects):
-    """A second mode at twice the first one's frequency: their energy goes to and fro."""
+    """A second mode at twice the first one's frequency: they exchange energy."""
     modes = sj.model.linear_modes([2.0, 4.0], [0.01, 0.01], [[1.0, 0.0]], [1.0, 0.0])
     potential = sj.model.polynomial_potential({"112": 0.5}, 2)
     return sj.model.structure(modes, potential, effects=effects)
@@ -377,7 +377,7 @@ def test_neimark_sacker_points_lie_where_responses_have_them(tori):
             found.append(again.frequency[np.argmin(np.abs(again.value - force))])
         # The response's multiplier is 1e-6 beyond the circle.
         np.testing.assert_allclose(np.sort(found), np.sort(located), rtol=1e-6)
-    # None below where the curve turns.
+    # None below the turning point of the curve.
     least = curve.value[curve.at_events("turn")[0]]
     for force, number in ((0.995 * least, 0), (1.005 * least, 2)):
         (response, *_) = sj.forced_response(coupled(), [force], 1.7, 2.3, harmonic_order=5)
@@ -385,7 +385,7 @@ def test_neimark_sacker_points_lie_where_responses_have_them(tori):
 
 
 @pytest.mark.long
-def test_neimark_sacker_points_feel_damping_that_depends_on_the_velocity():
+def test_neimark_sacker_points_depend_on_damping_that_depends_on_the_velocity():
     name, ends = "cubic_damping.coefficient", (1.7, 2.3)
     model = coupled(make_effect("cubic_damping", {"coefficient": 1e-3}))
     start = event_of(model, 0.4, ends, "neimark_sacker", order=5, stability=True)
@@ -487,7 +487,7 @@ def test_published_neimark_sacker_points_belong_to_two_curves():
 
 
 def _sorted(curve, force):
-    """Frequency and slow period where a curve passes a force."""
+    """Frequency and slow period where a curve crosses a force."""
     ahead = curve.value > force - 1e-9
     k = np.flatnonzero(ahead[1:] != ahead[:-1])
     slow = HZ / curve.second_frequency[k]
@@ -516,7 +516,7 @@ def test_period_doublings_lie_where_responses_have_them():
 # ------------------------------------------------------------------------------ what fails
 
 
-def test_wrong_arguments_say_so():
+def test_wrong_arguments_are_refused():
     model, start = duffing(), (np.ones((3, 1)), 1.2)
     wrong = (
         ({"kind": "branch_point", "to": (0.1, 0.2)}, "`kind` must be one of"),
@@ -538,7 +538,7 @@ def test_wrong_arguments_say_so():
 
 
 @pytest.mark.long
-def test_a_curve_says_where_it_stopped():
+def test_a_curve_reports_where_it_stopped():
     model = duffing()
     start = event_of(model, P, (0.5, 1.6), "fold")
     steps = sj.simulate.StepControl(max_points=5)

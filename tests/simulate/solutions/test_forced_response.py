@@ -28,9 +28,9 @@ def one_mode(potential=None, effects=(), omega=2.0, ratio=0.05, participation=1.
 
 
 def two_modes(strength=1.0, sign=1.0, length=1.0, time=1.0):
-    """Two coupled modes seen by two sensors; `length` and `time` count the units of a metre, s.
+    """Two coupled modes with two sensors; `length` and `time` count the units of a metre, s.
 
-    With strength 0 it is linear, and shares what was compiled for the nonlinear one.
+    With strength 0 it is linear, and uses the program compiled for the nonlinear one.
     """
     scaled = {
         key: strength * value * length ** (2 - len(key)) / time**2 * sign ** key.count("1")
@@ -104,10 +104,10 @@ def test_a_linear_structure_gives_its_linear_response(small_curves):
 def test_signs_of_modes_and_units_do_not_matter(small_curves):
     curve = small_curves["nonlinear"]
     # The steps are the same up to rounding in the scaled unknowns; along 100 steps it grows.
-    (turned,) = forced_response(two_modes(sign=-1.0), [0.2], 1.0, 3.5, harmonic_order=3)
-    np.testing.assert_allclose(turned.frequency, curve.frequency, rtol=1e-8)
-    np.testing.assert_allclose(turned.velocity, curve.velocity, atol=1e-8)
-    assert turned.event == curve.event
+    (flipped,) = forced_response(two_modes(sign=-1.0), [0.2], 1.0, 3.5, harmonic_order=3)
+    np.testing.assert_allclose(flipped.frequency, curve.frequency, rtol=1e-8)
+    np.testing.assert_allclose(flipped.velocity, curve.velocity, atol=1e-8)
+    assert flipped.event == curve.event
     # Millimetres and milliseconds: force in kg mm/ms² = 1e3 N, velocity in mm/ms = m/s.
     model = two_modes(length=1e3, time=1e3)
     (scaled,) = forced_response(model, [0.2e-3], 1.0e-3, 3.5e-3, harmonic_order=3)
@@ -155,9 +155,9 @@ def test_orbits_close_in_time(which, start, every, request, time_domain, state_o
         worst[0] = max(worst[0], truth.closure(state_of(curve.coefficients[k], curve.frequency[k])))
         worst[1] = max(worst[1], truth.closure(state_of(x, curve.frequency[k])))
         # The refined motion is the curve's, not another one at the same frequency.
-        size = np.abs(x).max()
+        largest = np.abs(x).max()
         np.testing.assert_allclose(
-            x[: curve.coefficients.shape[1]], curve.coefficients[k], rtol=0, atol=0.02 * size
+            x[: curve.coefficients.shape[1]], curve.coefficients[k], rtol=0, atol=0.02 * largest
         )
     # Truncation: 7e-5 (flat) and 3e-3 (curved) with 9 harmonics, 4e-9 and 5e-7 with 21.
     assert worst[1] < 1e-6
@@ -194,7 +194,7 @@ def test_folds_have_a_multiplier_of_one(flat_curve, curved_curves, time_domain, 
             )
             # The map's slope by differences is good to 1e-7.
             assert np.abs(multipliers - 1).min() < 1e-6
-            # and the frequency turns: both neighbours lie on the same side of the fold.
+            # and the frequency has an extremum: both neighbours lie on the same side of the fold.
             sides = np.sign(curve.frequency[[k - 1, k + 1]] - curve.frequency[k])
             assert abs(sides.sum()) == 2
 
@@ -282,7 +282,7 @@ SETTLED = {
 }
 
 
-def test_all_effects_without_memory_are_settled_below():
+def test_all_memoryless_effects_are_settled_below():
     memoryless = {k for k, effect in EFFECTS.items() if issubclass(effect, AbstractMemoryless)}
     assert set(SETTLED) == memoryless
 
@@ -290,8 +290,8 @@ def test_all_effects_without_memory_are_settled_below():
 @pytest.mark.parametrize("kind", SETTLED)
 def test_effects_agree_with_settled_motions(kind, time_domain, state_of):
     parameters, by_hand = SETTLED[kind]
-    # A preload is seen only beside a nonlinear stiffness; the others stand alone.
-    # All ten are there, nine of them with strength zero: one shape, which compiles once.
+    # A preload acts only together with a nonlinear stiffness; the others act alone.
+    # With all ten, nine of them at strength zero: one structure, compiled once.
     effects = [
         make_effect(name, parameters if name == kind else dict.fromkeys(others, 0.0))
         for name, (others, _) in SETTLED.items()
@@ -304,7 +304,7 @@ def test_effects_agree_with_settled_motions(kind, time_domain, state_of):
     assert bool(converged[0])
     x = np.asarray(found)[0, :, 0]
     # 25 periods of ζω = 0.1 leave e^{−7.5} of the start, and the motion decays from the balance's
-    # own answer (which is wrong by 1e-3 at most): 1e-6. Kinks cost the integrator nothing at 1e-8.
+    # own answer (which is wrong by 1e-3 at most): 1e-6. Corners cost no accuracy at 1e-8.
     truth = time_domain(model, force, omega, extra=by_hand)
     period = 2 * np.pi / omega
     settled = truth.integrate(state_of(x[:, None], omega), 25 * period, rtol=1e-9)[-1][0]
@@ -312,11 +312,11 @@ def test_effects_agree_with_settled_motions(kind, time_domain, state_of):
     orbit = truth.integrate(settled, period, rtol=1e-9, t_eval=times)[:, 0, 0]
     tau = omega * times[:, None] * np.arange(1, 10)
     balance = x[0] + np.cos(tau) @ x[1::2] + np.sin(tau) @ x[2::2]
-    # Nine harmonics of a motion with a kink in its force leave h⁻³ terms: below 2e-3.
+    # Nine harmonics of a motion with a corner in its force leave h⁻³ terms: below 2e-3.
     np.testing.assert_allclose(balance, orbit, rtol=0, atol=2e-3 * np.abs(orbit).max())
     linear = complex(linear_response(model.modes, jnp.array(omega), jnp.array(force))[0])
     change = abs(omega * 1j * (x[1] - 1j * x[2]) - linear) / abs(linear)
-    assert change > 0.03 or abs(x[0]) > 0.03  # the effect is seen
+    assert change > 0.03 or abs(x[0]) > 0.03  # the effect is visible
 
 
 # --------------------------------------------------------------------------- at given frequencies
@@ -331,8 +331,8 @@ def test_states_are_solved_each_from_its_own_guess(flat_curve):
     start = curve.coefficients[rows]
     found, converged = solved(model, curve.force, np.full(3, omega), start)
     assert converged == [True] * 3
-    size = np.linalg.norm(found, axis=(1, 2))
-    assert np.all(np.diff(size) < -0.05 * size.max())  # the upper branch comes first
+    norm = np.linalg.norm(found, axis=(1, 2))
+    assert np.all(np.diff(norm) < -0.05 * norm.max())  # the upper branch comes first
     start[1] = np.nan
     again, converged = solved(model, curve.force, np.full(3, omega), start)
     assert converged == [True, False, True]
@@ -403,20 +403,20 @@ def test_a_structure_of_nan_has_no_curve():
 
 
 def test_an_undamped_resonance_is_not_crossed():
-    """Both ends climb it until their points are used up, and both parts come back."""
+    """Both ends trace it up to the point limit, and both parts are returned."""
     # From 1.1 on: at 1.0 the second harmonic would stand at the undamped resonance itself.
     # The tolerance holds for the scaled unknowns, which reach 1e4 here: at 1e-9 the slow flanks
     # are true to 1e-6 only.
     steps = StepControl(max_points=400, tolerance=1e-11)
     parts = forced_response(with_drag(0.0), [0.2], 1.1, 3.0, harmonic_order=3, steps=steps)
     assert [part.status for part in parts] == [CurveStatus.POINT_LIMIT] * 2
-    # A step that may hide two events is divided by seven points.
+    # A step that may contain two events is subdivided by seven points.
     assert all(len(part.frequency) in (400, 407) for part in parts)
     assert set(parts[0].event + parts[1].event) == {""}  # neutral motions do not bifurcate
     assert parts[0].frequency[0] == 1.1
     assert parts[1].frequency[-1] == 3.0
     assert parts[0].frequency.max() < 2.0 < parts[1].frequency.min()
-    for part in parts:  # in the order of the frequency, and true where they are
+    for part in parts:  # in the order of the frequency, and exact
         assert np.all(np.diff(part.frequency) > 0)
         modes = with_drag(0.0).modes
         wanted = linear_response(modes, jnp.asarray(part.frequency), jnp.array(0.2))

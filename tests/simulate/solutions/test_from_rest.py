@@ -99,13 +99,13 @@ def test_each_stable_rest_has_its_response():
     here, there = curves[0], next(c for c in curves if c.branch == "from another equilibrium")
     assert here.coefficients[0, 0, 0] == pytest.approx(0.0, abs=0.01)
     assert there.coefficients[0, 0, 0] == pytest.approx(-2.0, abs=0.01)
-    # Under the force reversed in time by half a period the wells change places.
+    # Under the force reversed in time by half a period the wells are exchanged.
     peaks = [np.abs(c.velocity[:, 1, 0]).max() for c in (here, there)]
     assert peaks[0] == pytest.approx(peaks[1], rel=1e-4)
 
 
 @pytest.mark.parametrize("slides", [True, pytest.param(False, marks=pytest.mark.long)])
-def test_a_simulation_says_which_elements_do_nothing(slides):
+def test_a_simulation_reports_inactive_elements(slides):
     kind, parameters = (
         ("jenkins_slider", {"stiffness": 0.1 * OMEGA**2, "slip_displacement": 1e-3})
         if slides
@@ -125,8 +125,8 @@ def test_a_simulation_says_which_elements_do_nothing(slides):
             assert "more force" in str(notes[0])
 
 
-def test_friction_that_holds_asks_for_more_force():
-    """Two masses: the held one feels k F/(k₁ + k − Ω²m) through the spring between them."""
+def test_stuck_friction_asks_for_more_force():
+    """Two masses: the stuck one carries k F/(k₁ + k − Ω²m) through the spring between them."""
     structure = sj.model.from_matrices(
         *(np.eye(2), np.eye(2), np.array([[2e5, -1e5], [-1e5, 2e5]])),
         points=("a", "b"),
@@ -134,8 +134,8 @@ def test_friction_that_holds_asks_for_more_force():
         effects=[sj.model.make_effect("coulomb_friction", {"force": 1.0}, at="b")],
     )
     low, high = 20.0, 40.0
-    with pytest.raises(ValueError, match="raise the force") as told:
+    with pytest.raises(ValueError, match="raise the force") as refusal:
         simulate_responses(structure, [0.1], low, high, harmonics=3)
-    held = abs(2e5 - (high * HERTZ) ** 2 + 1j * high * HERTZ) / 1e5
-    assert f"slides from about {held:.3g} N on" in str(told.value)
-    assert "lower the force" not in str(told.value)
+    reaction = abs(2e5 - (high * HERTZ) ** 2 + 1j * high * HERTZ) / 1e5
+    assert f"slides only above about {reaction:.3g} N" in str(refusal.value)
+    assert "lower the force" not in str(refusal.value)

@@ -1,11 +1,11 @@
-"""Bouc and Wen's law and contacts that slip and part, in motions: against steps of our own."""
+"""Bouc and Wen's law and contacts that slip and part, in motions, against time integration."""
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import snrmjax as sj
-from snrmjax.model.places import between
+from snrmjax.model.attachment import between
 from snrmjax.simulate.continuation.stability import floquet_multipliers
 
 DAMPING, STIFFNESS = np.array([[0.1, -0.05], [-0.05, 0.1]]), np.array([[2.0, -1.0], [-1.0, 2.0]])
@@ -24,16 +24,16 @@ def hysteretic():
 def rates(t, y, omega):
     x, v, f = y[:2], y[2:4], y[4]
     way = v[1] - v[0]
-    pull = 0.5 * way * (1 - (f / 0.3) ** 2 * (0.6 * np.sign(way * f) + 0.4))
+    rate = 0.5 * way * (1 - (f / 0.3) ** 2 * (0.6 * np.sign(way * f) + 0.4))
     load = np.array([0.3 * np.cos(omega * t), 0.0]) - f * np.array([-1.0, 1.0])
-    return np.concatenate([v, load - DAMPING @ v - STIFFNESS @ x, [pull]])
+    return np.concatenate([v, load - DAMPING @ v - STIFFNESS @ x, [rate]])
 
 
 @pytest.fixture(scope="module")
 def in_time(hysteretic):
     """The settled state and one period of it, by SciPy."""
-    _, curve, place = hysteretic
-    omega = float(curve.frequency[place])
+    _, curve, index = hysteretic
+    omega = float(curve.frequency[index])
     period = 2 * np.pi / omega
     options = {"args": (omega,), "rtol": 1e-8, "atol": 1e-10}
     begin = solve_ivp(rates, (0, 150 * period), np.zeros(5), **options).y[:, -1]
@@ -42,8 +42,8 @@ def in_time(hysteretic):
 
 
 def test_the_balance_is_the_settled_motion(hysteretic, in_time):
-    model, curve, place = hysteretic
-    q = np.asarray(curve.coefficients[place]) @ np.asarray(model.modes.mode_shape).T
+    model, curve, index = hysteretic
+    q = np.asarray(curve.coefficients[index]) @ np.asarray(model.modes.mode_shape).T
     wanted = np.fft.rfft(in_time[2], axis=1)[:, [1, 3]] / 32
     for order, of in ((1, 0), (3, 1)):
         found = q[2 * order - 1] - 1j * q[2 * order]
@@ -51,7 +51,7 @@ def test_the_balance_is_the_settled_motion(hysteretic, in_time):
 
 
 def test_multipliers_are_those_of_the_map_over_a_period(hysteretic, in_time):
-    model, curve, place = hysteretic
+    model, curve, index = hysteretic
     omega, begin, _ = in_time
 
     def after(y):
@@ -63,7 +63,7 @@ def test_multipliers_are_those_of_the_map_over_a_period(hysteretic, in_time):
     columns = [(after(begin + step * e) - after(begin - step * e)) / (2 * step) for e in np.eye(5)]
     wanted = np.linalg.eigvals(np.stack(columns, axis=1))
     wanted = wanted[np.argsort(-np.abs(wanted))][:4]
-    found = floquet_multipliers(model, curve.coefficients[[place]], curve.frequency[[place]])[0]
+    found = floquet_multipliers(model, curve.coefficients[[index]], curve.frequency[[index]])[0]
     assert np.abs(np.sort(np.abs(found)) - np.sort(np.abs(wanted))).max() < 5e-4
     assert np.abs(found[:, None] - wanted).min(axis=1).max() < 1e-3
 
@@ -81,7 +81,7 @@ def surface(normal_force):
 
 
 def stepped(force, omega, periods=40, steps=2000):
-    """One period of the settled motion by Runge and Kutta's steps, the slider pushed after each."""
+    """One period of the settled motion by Runge and Kutta's steps, the slider updated last."""
     h, y, z, kept = 2 * np.pi / omega / steps, np.zeros(4), 0.0, []
 
     def pushed(z, x):
@@ -90,8 +90,8 @@ def stepped(force, omega, periods=40, steps=2000):
 
     def rate(t, y):
         inner = np.array([5 * (y[0] - pushed(z, y[:2])), max(21 * y[1], 0.0) - 100])
-        pull = force * np.cos(omega * t) - np.array([0.35, 2.0]) * y[2:] - [12.0, 21.0] * y[:2]
-        return np.concatenate([y[2:], pull - inner])
+        net = force * np.cos(omega * t) - np.array([0.35, 2.0]) * y[2:] - [12.0, 21.0] * y[:2]
+        return np.concatenate([y[2:], net - inner])
 
     for k in range(periods * steps):
         t = k * h
@@ -117,10 +117,10 @@ def test_a_contact_slips_with_its_normal_force_and_parts(normal_force):
     motion = sj.simulate.periodic_motion(model, force, curve.point(near), value=omega)
     q = np.asarray(motion.coefficients) @ np.asarray(model.modes.mode_shape).T
     wanted = stepped(force * np.array([1.0, normal_force]), omega)
-    size = np.abs(2 * wanted[1]).max()
-    np.testing.assert_allclose(q[0], wanted[0].real, atol=1e-3 * size)
+    largest = np.abs(2 * wanted[1]).max()
+    np.testing.assert_allclose(q[0], wanted[0].real, atol=1e-3 * largest)
     for order in (1, 2, 3):
         found = q[2 * order - 1] - 1j * q[2 * order]
-        np.testing.assert_allclose(found, 2 * wanted[order], atol=1e-3 * size)
+        np.testing.assert_allclose(found, 2 * wanted[order], atol=1e-3 * largest)
     parts = np.min(np.fft.irfft(wanted[:, 1] * 64, 64)) < 0
     assert parts == (normal_force > 1)

@@ -111,7 +111,7 @@ def test_the_second_well_vibrates_with_its_own_stiffness():
     load = force * float(model.modes.participation[0])
     linear = load / (stiffness - omega**2 + 2j * ratio * np.sqrt(squared) * omega)
     phasor = curve.coefficients[:, 1, 0] - 1j * curve.coefficients[:, 2, 0]
-    # A force so small that the motion, 1e-4 of the well's depth, is linear to that share squared.
+    # A force so small that the motion, 1e-4 of the well's depth, is linear to that ratio squared.
     np.testing.assert_allclose(phasor, linear, rtol=1e-4)
     np.testing.assert_allclose(curve.coefficients[:, 0, 0], well, rtol=1e-4)
     assert np.all(curve.is_stable)
@@ -144,5 +144,5 @@ def test_nothing_is_found_where_there_is_nothing():
     settings = ResponseSettings(harmonic_order=3, stability=False)
     found = isolated_responses(stiffening, 0.5, *ends, settings=settings)
     assert len(found) == 0
-    assert found.n_starts == 128 + 2 * 7 + 1  # random ones, at rest and beside it, one resonance
+    assert found.n_starts == 128 + 2 * 7 + 1  # random ones, at rest and linear, one resonance
     assert found.n_failed + found.n_known == found.n_starts

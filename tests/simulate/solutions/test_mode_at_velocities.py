@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import snrmjax as sj
 
-OMEGA, SHAPE = 3.0, -2.0  # the sensor counts against the mode
+OMEGA, SHAPE = 3.0, -2.0  # the sensor has the opposite sign
 
 
 def oscillator(quadratic=0.0, cubic=1.0):
@@ -62,20 +62,20 @@ def test_frequencies_at_velocities_are_those_of_free_motions():
 def test_derivatives_are_those_of_the_closed_form():
     velocity = jnp.array([2.0, 5.0])
 
-    def told(cubic, velocity):
+    def frequency_of(cubic, velocity):
         model = oscillator()
         where = model.potential.coefficient * jnp.array([1.0, cubic])
         model = eqx.tree_at(lambda m: m.potential.coefficient, model, where)
         return sj.simulate.normal_mode_at_velocities(model, velocity, harmonic_order=1).frequency
 
     # One harmonic: Ω⁴ − ω²Ω² − ¾ γ (v/φ)² = 0.
-    omega = told(1.0, velocity)
+    omega = frequency_of(1.0, velocity)
     np.testing.assert_allclose(omega**4, OMEGA**2 * omega**2 + 0.75 * (velocity / SHAPE) ** 2)
     by_omega = 4 * omega**3 - 2 * OMEGA**2 * omega
     by_cubic = 0.75 * (velocity / SHAPE) ** 2 / by_omega
     by_velocity = 1.5 * velocity / SHAPE**2 / by_omega
-    np.testing.assert_allclose(jax.jacfwd(told)(1.0, velocity), by_cubic, rtol=1e-10)
-    slopes = jax.jacrev(told, 1)(1.0, velocity)
+    np.testing.assert_allclose(jax.jacfwd(frequency_of)(1.0, velocity), by_cubic, rtol=1e-10)
+    slopes = jax.jacrev(frequency_of, 1)(1.0, velocity)
     np.testing.assert_allclose(slopes, np.diag(by_velocity), rtol=1e-10, atol=1e-14)
 
 

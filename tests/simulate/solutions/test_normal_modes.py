@@ -137,9 +137,9 @@ def test_curved_beam_softens_then_stiffens():
     branch = nonlinear_normal_mode(model, 80 * HZ)
     assert branch.status == CurveStatus.UPPER_END
     assert branch.frequency.min() < 0.75 * branch.frequency[0]
-    turn = int(np.argmin(branch.frequency))
-    assert np.all(np.diff(branch.frequency[:turn]) < 0)
-    assert np.all(np.diff(branch.frequency[turn:]) > 0)
+    fold = int(np.argmin(branch.frequency))
+    assert np.all(np.diff(branch.frequency[:fold]) < 0)
+    assert np.all(np.diff(branch.frequency[fold:]) > 0)
 
 
 def test_an_effect_that_stores_energy_counts(effect_branch):
@@ -163,9 +163,9 @@ def test_flat_beam_carries_a_tongue(flat_branch):
     branch = flat_branch
     assert branch.status == CurveStatus.UPPER_END
     hz = branch.frequency / HZ
-    turns = np.flatnonzero(np.diff(np.sign(np.diff(hz))) != 0) + 1
-    assert len(turns) == 2
-    tip, root = turns
+    folds = np.flatnonzero(np.diff(np.sign(np.diff(hz))) != 0) + 1
+    assert len(folds) == 2
+    tip, root = folds
     assert hz[tip] == pytest.approx(90.2, abs=0.05)
     assert hz[root] == pytest.approx(87.5, abs=0.05)
     fundamental = branch.coefficients[:, 1, 0]
@@ -218,7 +218,7 @@ def test_stability_along_the_tongue_is_that_of_integrated_motions(
     model = eqx.tree_at(lambda m: m.modes.damping_ratio, flat_beam(), jnp.zeros(4))
     assert np.all(branch.stability[branch.frequency < 87.4 * HZ] == 1)
     (unstable,) = (np.flatnonzero(branch.stability == 0),)
-    assert np.all(np.diff(unstable) == 1)  # one stretch, from one fold of the tongue to the other
+    assert np.all(np.diff(unstable) == 1)  # one section, from one fold of the tongue to the other
     for k in (unstable[0] - 10, unstable[len(unstable) // 2], unstable[-1] + 10):
         motion = with_sines(branch.coefficients[k])
         state = state_of(motion, branch.frequency[k])
@@ -229,7 +229,7 @@ def test_stability_along_the_tongue_is_that_of_integrated_motions(
         assert nearest.max() < 5e-3 * np.abs(truth).max(), k
 
 
-def test_two_masses_have_a_tongue_of_three_and_lose_stability_where_scipy_says():
+def test_two_masses_have_a_tongue_of_three_and_lose_stability_as_by_scipy():
     """Kerschen et al. 2009: in phase, mode 2 in its third harmonic near √2 rad/s."""
     spring = make_effect("cubic_stiffness", {"coefficient": 0.5}, at="x1")
     stiffness = np.array([[2.0, -1.0], [-1.0, 2.0]])
@@ -284,7 +284,7 @@ def test_a_structure_of_nan_has_no_start():
 
 
 @pytest.mark.parametrize("frequency", [0.0, -1.0, np.nan, W])
-def test_a_frequency_that_leads_nowhere_is_refused(frequency):
+def test_an_impossible_frequency_is_refused(frequency):
     with pytest.raises(ValueError, match="`to_frequency` must be positive and differ from"):
         nonlinear_normal_mode(duffing(), frequency)
 

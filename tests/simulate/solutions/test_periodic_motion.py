@@ -122,7 +122,7 @@ def test_conditions_are_met_and_differentiated(condition, curve):
         assert float(found.amplitude) == pytest.approx(value, rel=1e-12)
     else:
         (k,) = curve.at_events(condition)[:1]
-        # The curve's own event: located with tangents late by 1e-6; the slider moves it.
+        # The curve's own event: located with tangents off by 1e-6; the slider moves it.
         tolerance = 1e-2 if condition == "fold" else 1e-6
         assert float(found.frequency) == pytest.approx(curve.frequency[k], rel=tolerance)
     if condition == "phase_resonance":
@@ -132,7 +132,7 @@ def test_conditions_are_met_and_differentiated(condition, curve):
     np.testing.assert_allclose(reverse / scale, forward / scale, rtol=0, atol=1e-11)
     slope = by_differences(jax.jit(quantities), zero, 1e-4)
     # Fourth order in 1e-4, and Newton's rounding 1e-13 over it. The force of the slider is
-    # piecewise linear in the samples: where one of 256 changes sides it bends by 1e-6.
+    # piecewise linear in the samples: where one of 256 changes side its slope jumps by 1e-6.
     np.testing.assert_allclose(forward / scale, slope / scale, rtol=0, atol=1e-6)
     assert np.linalg.matrix_rank(forward) >= (2 if value is not None else 1)
 
@@ -141,15 +141,15 @@ def test_conditions_are_met_and_differentiated(condition, curve):
 def test_gradients_of_the_flat_beam(flat_curve):
     """Peak amplitude and both folds by all 55 coefficients, 4 frequencies and 4 dampings."""
     model, curve = flat_curve
-    places = [("peak", 0), ("fold", 0), ("fold", 1)]
-    starts = [curve.point(curve.at_events(kind)[k]) for kind, k in places]
+    events = [("peak", 0), ("fold", 0), ("fold", 1)]
+    starts = [curve.point(curve.at_events(kind)[k]) for kind, k in events]
 
     def quantities(shifts):
         pad = jnp.zeros(sum(v.size for v in numbers(model)) - 63)
         now = changed(model, jnp.concatenate([shifts, pad]))
         found = [
             periodic_motion(now, curve.force, start, condition=kind)
-            for start, (kind, _) in zip(starts, places, strict=True)
+            for start, (kind, _) in zip(starts, events, strict=True)
         ]
         return jnp.stack([found[0].amplitude, found[1].frequency, found[2].frequency])
 
@@ -158,12 +158,12 @@ def test_gradients_of_the_flat_beam(flat_curve):
     slope = by_differences(compiled, np.zeros(63), 3e-3)
     fraction = np.abs(gradient) / np.abs(gradient).max(axis=1, keepdims=True)
     # Fourth order in 3e-3 for logarithmic derivatives of order one: 1e-7; Newton's rounding
-    # 1e-13/3e-3 is 3e-5 of the smallest that are looked at by their own size.
+    # 1e-13/3e-3 is 3e-5 of the smallest that are compared relative to themselves.
     seen = fraction > 1e-6
     assert np.sum(seen, axis=1).tolist() == [20, 22, 11]
     assert np.max(np.abs(slope / gradient - 1)[seen]) < 1e-6
-    size = np.abs(gradient).max(axis=1, keepdims=True)
-    np.testing.assert_allclose(slope / size, gradient / size, rtol=0, atol=1e-9)
+    largest = np.abs(gradient).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(slope / largest, gradient / largest, rtol=0, atol=1e-9)
 
 
 # ----------------------------------------------------------------------------------- exact ones
@@ -263,7 +263,7 @@ def test_a_motion_that_is_not_there_is_nan():
     slope = jax.grad(
         lambda f: periodic_motion(model, f, far, condition="velocity", value=30.0).frequency
     )(FORCE)
-    assert np.isnan(slope)  # zero would tell an optimiser that it has arrived
+    assert np.isnan(slope)  # a zero would make an optimiser stop
     broken = eqx.tree_at(lambda m: m.potential.coefficient, model, jnp.array([jnp.nan, 1.0]))
     found = periodic_motion(broken, FORCE, far, condition="velocity", value=0.1)
     assert not bool(found.converged)

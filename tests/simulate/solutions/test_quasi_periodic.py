@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import snrmjax as sj
-from snrmjax.model.places import between
+from snrmjax.model.attachment import between
 from snrmjax.pipelines.simulate import simulate_responses
 from snrmjax.simulate.solutions.quasi_periodic import TorusEnd
 
@@ -37,16 +37,16 @@ def test_the_branch_goes_from_one_bifurcation_to_the_other(pair):
         np.testing.assert_allclose(ends[0], np.abs(branch.velocity[0]), rtol=1e-12)
     assert branch.modulation[-1] < 0.02 < branch.modulation.max()
     first, last = response.at_events("neimark_sacker")
-    for place, end in ((first, 0), (last, -1)):
-        angles = np.abs(np.angle(response.multipliers[place]))
-        slow = angles / (2 * np.pi) * response.frequency[place]
+    for index, end in ((first, 0), (last, -1)):
+        angles = np.abs(np.angle(response.multipliers[index]))
+        slow = angles / (2 * np.pi) * response.frequency[index]
         assert np.min(np.abs(slow - branch.slow_frequency[end])) < 2e-4
 
 
 def test_a_motion_is_the_one_that_scipy_finds(pair):
     _, _, branch = pair
-    place = int(np.argmin(np.abs(branch.frequency - 1.15)))
-    omega = float(branch.frequency[place])
+    index = int(np.argmin(np.abs(branch.frequency - 1.15)))
+    omega = float(branch.frequency[index])
 
     def rates(t, y):
         x, v = y[:2], y[2:]
@@ -60,18 +60,18 @@ def test_a_motion_is_the_one_that_scipy_finds(pair):
     times = period * np.arange(150 * 40) / 40
     motion = solve_ivp(rates, (0, times[-1]), begin, t_eval=times, **options).y[2:]
     np.testing.assert_allclose(
-        np.abs(motion).max(axis=1), branch.largest_velocity[place], rtol=0.01
+        np.abs(motion).max(axis=1), branch.largest_velocity[index], rtol=0.01
     )
-    turn = np.exp(-1j * omega * times) * np.hanning(len(times))
-    mean = 2 * np.abs(motion @ turn) / np.sum(np.hanning(len(times)))
-    np.testing.assert_allclose(mean, np.abs(branch.velocity[place]), rtol=5e-3)
+    demodulation = np.exp(-1j * omega * times) * np.hanning(len(times))
+    mean = 2 * np.abs(motion @ demodulation) / np.sum(np.hanning(len(times)))
+    np.testing.assert_allclose(mean, np.abs(branch.velocity[index]), rtol=5e-3)
     # The amplitude goes up and down: of the part of the spectrum about Ω, ends of the record cut.
     spectrum = np.fft.fft(motion, axis=1)
     order = np.fft.fftfreq(len(times), times[1]) * period
     around = np.where(np.abs(order - 1) < 0.5, 2 * spectrum, 0.0)
-    size = np.abs(np.fft.ifft(around, axis=1))[:, 1000:-1000]
-    np.testing.assert_allclose(size.max(axis=1), branch.largest_amplitude[place], rtol=0.02)
-    np.testing.assert_allclose(size.min(axis=1), branch.least_amplitude[place], rtol=0.03)
+    amplitude = np.abs(np.fft.ifft(around, axis=1))[:, 1000:-1000]
+    np.testing.assert_allclose(amplitude.max(axis=1), branch.largest_amplitude[index], rtol=0.02)
+    np.testing.assert_allclose(amplitude.min(axis=1), branch.least_amplitude[index], rtol=0.03)
 
 
 @pytest.mark.long
@@ -105,7 +105,7 @@ def test_what_cannot_be_followed_is_refused(pair):
     slider = {"stiffness": 1.0, "slip_displacement": 1.0}
     stuck = sj.model.make_effect("jenkins_slider", slider, at="x1")
     rubbing = sj.model.from_matrices(np.diag(MASS), DAMPING, STIFFNESS, force="x1", effects=stuck)
-    with pytest.raises(ValueError, match="with a memory"):
+    with pytest.raises(ValueError, match="with internal variables"):
         sj.simulate.quasi_periodic_branch(rubbing, response)
-    with pytest.raises(ValueError, match="with a memory"):
+    with pytest.raises(ValueError, match="with internal variables"):
         simulate_responses(rubbing, [0.1], 0.1, 0.2, quasi_periodic=True)

@@ -1,4 +1,4 @@
-"""Motions that are carried along: against a fold's closed form, and in an optimisation."""
+"""Continued motions: against a fold's closed form, and in an optimisation."""
 
 import equinox as eqx
 import jax
@@ -38,8 +38,8 @@ def upper_fold(cubic):
 
     peak = (LOAD * FORCE / (2 * RATIO * OMEGA**2)) ** 2
     grid = np.geomspace(1e-6, 1.0, 2000) * peak
-    (turns,) = np.nonzero(np.diff(np.signbit([left(square)[0] for square in grid])))
-    ends = grid[turns[-1]], grid[turns[-1] + 1]
+    (changes,) = np.nonzero(np.diff(np.signbit([left(square)[0] for square in grid])))
+    ends = grid[changes[-1]], grid[changes[-1] + 1]
     return np.sqrt(left(brentq(lambda square: left(square)[0], *ends, xtol=1e-300))[1])
 
 
@@ -52,7 +52,7 @@ def fold():
     return TrackedMotion(oscillator(), FORCE, start, condition="fold"), start
 
 
-def test_a_fold_is_carried_to_where_a_fixed_start_finds_another(fold):
+def test_a_fold_is_continued_to_where_a_fixed_start_finds_another(fold):
     tracked, start = fold
 
     @jax.jit
@@ -95,7 +95,7 @@ def test_where_the_motion_ends_on_the_way_all_is_nan(fold):
     assert np.isnan(slope)
 
 
-def test_what_cannot_be_carried_is_refused(fold):
+def test_what_cannot_be_continued_is_refused(fold):
     tracked, (coefficients, frequency) = fold
     with pytest.raises(ValueError, match="`model` has other monomials than"):
         tracked.at(structure(oscillator().modes, polynomial_potential({"111": 1.0}, 1)))

@@ -1,4 +1,4 @@
-"""The virtual laboratory against transfer functions, and against a plain integration of its own."""
+"""The virtual laboratory against transfer functions, and against an independent integration."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +40,7 @@ def fundamental(signal, hertz):
     return 2 * np.mean(part * np.exp(-2j * np.pi * hertz * time))
 
 
-def test_the_shaker_drives_as_its_equations_say(linear):
+def test_the_shaker_obeys_its_equations(linear):
     laboratory, record = linear
     shaker, s = laboratory.shaker, 2j * np.pi * 42.0
     mobility = s / (MASS * (s**2 + 2 * RATIO * REST * s + REST**2))
@@ -50,7 +50,7 @@ def test_the_shaker_drives_as_its_equations_say(linear):
     force = pushed / (1 + armature * mobility / s)
     seen = fundamental(record.force, 42.0), fundamental(record.velocity, 42.0)
     # Cubics between samples are (ω period)⁴ 19/720 = 5e-7 weaker and a sample late; the filter at
-    # three times the rate turns both channels alike.
+    # three times the rate shifts the phase of both channels alike.
     sections = butter(4, 500.0, fs=3 * RATE, output="ba")
     chain = freqz(*sections, worN=[42.0], fs=3 * RATE)[1][0] * np.exp(-s / RATE)
     np.testing.assert_allclose(seen[0], force * chain, rtol=1e-5)
@@ -127,7 +127,7 @@ def test_a_shaker_may_be_a_source_of_force_without_dynamics():
     states = sj.simulate.steady_states_of(laboratory, test)
     np.testing.assert_allclose(states.force, 3.0, rtol=1e-6)
     exact = sj.model.linear_response(structure().modes, omega, np.full(2, 3.0))
-    # What e^(−ζωt) has left after 300 cycles at 1 %: 7e-9; the integrator errs by 1e-6.
+    # The transient e^(−ζωt) after 300 cycles at 1 %: 7e-9; the integrator errs by 1e-6.
     np.testing.assert_allclose(states.velocity, exact, rtol=1e-5)
 
 
@@ -152,7 +152,7 @@ def test_microslip_settles_where_the_steady_cycle_is():
         sj.simulate.stepped_sine_test(laboratory, 600.0, frequencies[1:2])
 
 
-def test_what_cannot_stand_in_the_laboratory_is_refused():
+def test_impossible_laboratories_are_refused():
     slider = effect("jenkins_slider", stiffness=1e4, slip_displacement=1e-4)
     stop = effect("one_sided_stop", stiffness=100 * REST**2, gap=1e-4)
     for acting, shaker, words in (

@@ -1,4 +1,4 @@
-"""The virtual test: which states it records, that they are true, and what errors it adds."""
+"""The virtual test: the recorded states, their exactness, and the added errors."""
 
 from types import SimpleNamespace
 
@@ -30,7 +30,7 @@ TINY = (1e-9, 2e-9)  # N: nonlinear terms change the response by 1e-6 and less
 
 
 def run(forces=FORCES, **options):
-    """The curved beam's test with what is compiled already: two levels of eight states."""
+    """The test of the curved beam in a shape compiled once: two levels of eight states."""
     options = {"points_per_level": 8} | options
     return phase_resonance_test(curved_beam(), forces, *RANGE, **options)
 
@@ -170,7 +170,7 @@ def test_errors_are_drawn_from_the_seed():
     np.testing.assert_array_equal(first.frequency, other.frequency)  # known exactly
 
 
-def test_errors_have_the_stated_sizes():
+def test_errors_have_the_stated_standard_deviations():
     kept = (2, 3)
     errors = MeasurementErrors(amplitude=0.02, phase=0.03, force=0.015, harmonic=1e-4)
     truth = run(TINY, points_per_level=40, recording=Recording(keep_harmonics=kept)).steady_states
@@ -203,14 +203,14 @@ def test_errors_have_the_stated_sizes():
     for part in harmonics.T:
         assert np.sqrt(np.mean(np.abs(part) ** 2)) == pytest.approx(errors.harmonic, rel=0.1)
         assert np.std(part.real) == pytest.approx(errors.harmonic / np.sqrt(2), rel=0.12)
-    # And the table says so.
+    # The table states the same.
     np.testing.assert_allclose(noisy.velocity_std, 0.02 * np.abs(noisy.velocity), rtol=1e-14)
     np.testing.assert_array_equal(noisy.phase_std, 0.03)
     np.testing.assert_allclose(noisy.force_std, 0.015 * truth.force, rtol=1e-14)
     np.testing.assert_array_equal(noisy.harmonic_std, 1e-4)
 
 
-def test_level_errors_are_shared_within_a_level():
+def test_level_errors_are_common_to_a_level():
     forces = tuple(np.linspace(1e-9, 5e-9, 20))
     errors = MeasurementErrors(level_gain=0.1, level_phase=0.2)
     exact, drawn = (Recording(one, seed=5, keep_harmonics=(2,)) for one in (EXACT.errors, errors))
@@ -222,7 +222,7 @@ def test_level_errors_are_shared_within_a_level():
     # 20 draws: 1/√40 = 16 % of the standard deviation, three of them.
     assert np.std(np.abs(ratio[:, 0])) == pytest.approx(0.1, rel=0.5)
     assert np.std(np.angle(ratio[:, 0])) == pytest.approx(0.2, rel=0.5)
-    # The same gain for the harmonics of a state, and twice the turn for the second: an error of
+    # The same gain for the harmonics of a state, and twice the phase for the second: an error of
     # time. Nothing is stated for single rows.
     own = np.asarray(noisy.harmonics / truth.harmonics)[:, 0, 0].reshape(20, 4)
     np.testing.assert_allclose(own, ratio**2 / np.abs(ratio), rtol=1e-12)
@@ -233,7 +233,7 @@ def test_level_errors_are_shared_within_a_level():
 # ----------------------------------------------------------------------- the measurement chain
 
 
-def test_what_is_recorded_went_through_the_chain_in_order():
+def test_the_chain_is_applied_in_order():
     """Shape change, then far modes, then the instruments: by hand, harmonics included."""
     parameters = {
         "sensor_phase_error": {"phase_deg": 4.0},
@@ -264,7 +264,7 @@ def test_what_is_recorded_went_through_the_chain_in_order():
     np.testing.assert_array_equal(found.frequency, omega)
 
 
-def test_sensors_see_the_rigid_body_motion_too():
+def test_sensors_record_the_rigid_body_motion_too():
     modes = linear_modes(
         [500.0],
         [0.02],
@@ -361,7 +361,7 @@ def test_a_range_without_resonance_has_no_states():
         phase_resonance_test(curved_beam(), TINY, 30 * HZ, 40 * HZ)
 
 
-def test_one_state_and_odd_numbers_are_shared_among_the_sides():
+def test_one_state_and_odd_numbers_are_divided_between_the_sides():
     forces = tuple(np.linspace(1e-9, 2e-9, 16))
     states = run(forces, points_per_level=1).steady_states
     assert states.level.tolist() == list(range(1, 17))
@@ -370,10 +370,10 @@ def test_one_state_and_odd_numbers_are_shared_among_the_sides():
     assert int(jnp.sum(jnp.angle(states.velocity) > 0)) == 48
 
 
-def test_a_sweep_turns_round_where_it_lands():
+def test_a_sweep_reverses_where_it_lands():
     # Along the curve: a low branch up to 10, back unstable, one from 2 to 8, back unstable, and one
     # from 6.5 on. The sweep up jumps past the middle branch; the sweep down lands inside it, and
-    # finds its upper end only by turning round.
+    # reaches its upper end only by reversing.
     frequency = np.array([1.0, 5, 10, 6, 2, 2.5, 4, 5.5, 7, 8, 7.5, 6.5, 9, 12])
     stable = np.array([1, 1, 1, 0, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1], dtype=bool)
     curve = SimpleNamespace(

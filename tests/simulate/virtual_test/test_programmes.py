@@ -1,4 +1,4 @@
-"""Programmes in the virtual laboratory: what they hold, against Duffing's oscillator."""
+"""Programmes in the virtual laboratory: controlled motions against Duffing's oscillator."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,13 +13,13 @@ RATE = 3000.0
 @pytest.fixture(scope="module")
 def laboratory():
     shaker = sj.simulate.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
-    # The sensor looks the other way: states must come out with the model's sign.
+    # The sensor has the opposite sign: states must come out with the model's sign.
     return sj.simulate.Laboratory(beam(sign=-1.0), shaker, sj.simulate.Instruments(), RATE)
 
 
-def impedance(size, omega):
+def impedance(amplitude, omega):
     """F/v of one term of harmonic balance at a displacement amplitude, N s/m."""
-    square = REST**2 + 0.75 * CUBIC * size**2 - omega**2
+    square = REST**2 + 0.75 * CUBIC * amplitude**2 - omega**2
     return MASS * (2 * RATIO * REST + square / (1j * omega))
 
 
@@ -53,8 +53,8 @@ def test_phase_after_phase_a_loop_goes_around_the_fold(laboratory):
     phases, gains = np.radians([0.0, -40.0, -65.0, -80.0]), sj.simulate.LoopGains(80.0, 12.0)
     sweep = sj.simulate.phase_sweep(laboratory, 20.0, phases, gains=gains, settle_cycles=150)
     assert sweep.held.all()
-    size = np.abs(sweep.velocity) / sweep.frequency
-    needed = impedance(size, sweep.frequency) * sweep.velocity
+    amplitude = np.abs(sweep.velocity) / sweep.frequency
+    needed = impedance(amplitude, sweep.frequency) * sweep.velocity
     np.testing.assert_allclose(needed.real, sweep.force, rtol=3e-3)
     np.testing.assert_allclose(needed.imag / sweep.force, 0, atol=0.015)
     np.testing.assert_allclose(np.angle(sweep.velocity), phases, atol=np.radians(0.5))
@@ -104,7 +104,7 @@ def test_multisine_and_sweep_are_what_was_asked_for(laboratory):
     assert 2 * np.pi * hertz[peak] == pytest.approx(0.96 * REST, rel=0.03)  # late
 
 
-def test_numbers_that_make_no_sense_are_refused(laboratory):
+def test_invalid_numbers_are_refused(laboratory):
     with pytest.raises(ValueError, match="`frequencies` must be positive"):
         sj.simulate.stepped_sine_test(laboratory, 1.0, np.array([REST, -1.0]))
     with pytest.raises(ValueError, match="`lines` must lie between 1 and half"):

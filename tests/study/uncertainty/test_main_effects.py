@@ -1,4 +1,4 @@
-"""Shares of variance against functions whose indices are known in closed form."""
+"""Fractions of variance against functions whose indices are known in closed form."""
 
 import numpy as np
 import pytest
@@ -19,11 +19,11 @@ PARTS = np.array([0.5 * (1 + B * np.pi**4 / 5) ** 2, A**2 / 8, 0.0])
 VARIANCE = A**2 / 8 + B * np.pi**4 / 5 + B**2 * np.pi**8 / 18 + 0.5
 
 
-def test_the_shares_of_ishigamis_function():
+def test_the_fractions_of_ishigamis_function():
     x = np.random.default_rng(1).uniform(-np.pi, np.pi, (3, 20_000))
     found = [main_effect(one, ishigami(x)) for one in x]
     fractions = np.array([one.fraction for one in found])
-    # Three standard errors of a sample of 20000 are below 0.02 (the intervals say so too).
+    # Three standard errors of a sample of 20000 are below 0.02 (as the intervals state).
     np.testing.assert_allclose(fractions, PARTS / VARIANCE, atol=0.02)
     assert all(one.half_width < 0.015 for one in found)
     # E[y | x₁] = sin x₁ (1 + b π⁴/5) + a/2, within the curve's own 95 % band, nearly everywhere.
@@ -31,7 +31,7 @@ def test_the_shares_of_ishigamis_function():
     assert np.mean(np.abs(found[0].mean - truth) < 1.5 * found[0].error) > 0.95
 
 
-def test_intervals_hold_the_true_share_about_as_often_as_they_say():
+def test_intervals_have_their_nominal_coverage():
     random, inside = np.random.default_rng(2), 0
     n_trials, coefficients = 100, np.array([1.0, 0.6, 0.3])
     truth = coefficients**2 / np.sum(coefficients**2)
@@ -43,7 +43,7 @@ def test_intervals_hold_the_true_share_about_as_often_as_they_say():
     assert 87 <= inside <= 99
 
 
-def test_a_needless_quantity_has_no_share_on_average():
+def test_an_inactive_quantity_has_no_fraction_on_average():
     random = np.random.default_rng(3)
     fractions = [
         main_effect(random.random(200), random.standard_normal(200)).fraction for _ in range(100)
@@ -81,7 +81,7 @@ def test_members_without_a_value_are_left_out():
     assert main_effect(np.ones_like(x), x) is None
 
 
-def test_quantities_that_vary_together_are_told():
+def test_quantities_that_vary_together_are_reported():
     z = np.random.default_rng(5).standard_normal((3, 400))
     assert correlated_pairs({"a": z[0], "b": z[1], "c": z[2]}) == []
     assert correlated_pairs({"a": z[0], "b": z[1], "c": 0.5 * z[0] + z[2]}) == [("a", "c")]

@@ -57,7 +57,7 @@ def test_a_linear_peak_is_that_of_a_lognormal_number():
     np.testing.assert_allclose(peak.gradient[1], nominal * slope, rtol=1e-8)
     np.testing.assert_allclose(peak.hessian[1], nominal * np.outer(slope, slope), rtol=1e-7)
     found = propagate_uncertainty(peak)
-    # Mean and deviation are those of the formulas, and first order says that it is wrong.
+    # Mean and deviation are those of the formulas, and a note reports the first-order error.
     assert found.statistics[0, 1, 1] == pytest.approx(nominal * std, rel=1e-8)
     assert found.statistics[1, 0, 1] == pytest.approx(nominal * (1 + std**2 / 2), rel=1e-7)
     assert [(one.kind, one["quantity"]) for one in found.notes] == [

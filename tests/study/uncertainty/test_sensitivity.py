@@ -49,7 +49,7 @@ def test_sobol_indices_of_ishigamis_function():
     assert "first" in repr(found)
 
 
-def test_shares_of_a_product_of_lognormal_numbers():
+def test_fractions_of_a_product_of_lognormal_numbers():
     # With s² the variance of the logarithms the first index of input i is
     # (e^s_i² − 1)/(e^Σs² − 1).
     std = np.array([0.05, 0.2, 0.1])
@@ -64,7 +64,7 @@ def test_shares_of_a_product_of_lognormal_numbers():
 def test_quantities_that_vary_together_are_one_input():
     pair = MultivariateNormal(["a", "b"], [0.0, 0.0], [[1.0, 0.8], [0.8, 1.0]])
     found = sobol_indices(studied((pair, Normal("c", 0.0, 1.0)), 4 * 1024, lambda x: x.sum(axis=1)))
-    # Var(a + b) = 3.6 beside Var(c) = 1.
+    # Var(a + b) = 3.6, Var(c) = 1.
     assert found.input_names == ("a, b", "c")
     np.testing.assert_allclose(found.first[0], [3.6 / 4.6, 1 / 4.6], atol=0.02)
     np.testing.assert_allclose(found.total[0], found.first[0], atol=0.02)

@@ -1,1 +1,1 @@
-"""Files of named arrays: MATLAB, HDF5, netCDF, and what their names and shapes say."""
+"""Files of named arrays (MATLAB, HDF5, netCDF), interpreted by names and shapes."""

@@ -1,4 +1,4 @@
-"""The frequency axis of responses that a start and a step state in place of a vector."""
+"""Frequency axis of responses given by start and step in place of a vector."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -18,24 +18,24 @@ _STEP = (
     rf"(d|delta)_?{_FREQUENCY}|{_FREQUENCY}_?(step|inc|increment|delta|res|resolution|spacing)"
     rf"|(step|increment|resolution)_?{_FREQUENCY}"
 )
-_FEWEST = 8  # lines along an axis that no vector has
+_FEWEST = 8  # least number of lines along an axis without a vector
 
 
 class EvenAxis(NamedTuple):
-    """Frequencies in Hz from a start in even steps."""
+    """Evenly spaced frequencies, start and step in Hz."""
 
     start: float
     step: float
 
     def hertz(self, count: int) -> Float[np.ndarray, " line"]:
-        """That many frequencies."""
+        """The first `count` frequencies in Hz."""
         return self.start + self.step * np.arange(count)
 
 
 def axis_of_options(start: float, step: float) -> EvenAxis | None:
-    """The frequencies of responses without any, or None: none are stated.
+    """The stated frequencies of responses without an axis, or None.
 
-    Raises `ValueError` for a start without a step, and for numbers that are no frequencies.
+    Raises `ValueError` for a start without a step, and for negative or infinite numbers.
     """
     for flag, number in (("start", start), ("step", step)):
         if not 0 <= number < float("inf"):
@@ -46,37 +46,37 @@ def axis_of_options(start: float, step: float) -> EvenAxis | None:
 
 
 def stated_axis(numbers: Mapping[str, Numbers]) -> EvenAxis | None:
-    """The axis that two single numbers of a struct state by their names, or None."""
-    found: dict[str, float] = {}
+    """The axis given by two scalars of a struct, recognised by name, or None."""
+    stated: dict[str, float] = {}
     for key, role in axis_keys(numbers).items():
         array = numbers[key]
         unit = array.unit or label_of(key).unit
-        found.setdefault(role, float(array.vector(key)[0]) * in_hertz(unit))
-    axis = EvenAxis(found.get("start", np.nan), found.get("step", np.nan))
+        stated.setdefault(role, float(array.vector(key)[0]) * in_hertz(unit))
+    axis = EvenAxis(stated.get("start", np.nan), stated.get("step", np.nan))
     is_good = np.isfinite(axis).all() and axis.start >= 0 and axis.step > 0
     return axis if is_good else None
 
 
 def axis_keys(numbers: Mapping[str, Numbers]) -> dict[str, str]:
-    """Which single numbers are the start and the step of frequencies, by their names."""
-    found = {}
+    """The scalars that are start and step of the frequencies, by name."""
+    keys = {}
     for key, array in numbers.items():
         word = label_of(key).word.rsplit(".", 1)[-1]
         for role, pattern in (("start", _START), ("step", _STEP)):
             is_one = array.size == 1 and not array.is_complex
             if is_one and re.fullmatch(pattern, word, re.IGNORECASE):
-                found[key] = role
-    return found
+                keys[key] = role
+    return keys
 
 
-def side_of_lines(sides: Sequence[int]) -> int | None:
-    """Which of the sides is along the frequency: the only longest one, if it is long."""
-    longest = max(sides, default=0)
-    return longest if longest >= _FEWEST and list(sides).count(longest) == 1 else None
+def frequency_dimension(dimensions: Sequence[int]) -> int | None:
+    """Length of the frequency dimension: the unique longest one, if long enough."""
+    longest = max(dimensions, default=0)
+    return longest if longest >= _FEWEST and list(dimensions).count(longest) == 1 else None
 
 
 def is_mark(name: str, array: Numbers) -> bool:
-    """Whether an array marks lines (valid, overloaded, a count of averages) by name and numbers."""
+    """Whether an array flags lines (valid, overloaded, number of averages), by name and values."""
     if array.is_complex:
         return False
     values = array.vector(name)
@@ -88,7 +88,7 @@ def is_mark(name: str, array: Numbers) -> bool:
 
 
 def in_hertz(unit: str) -> float:
-    """What a number in a unit is multiplied with; 1 where it is none of a frequency."""
+    """Factor from a unit to Hz; 1 for a unit of another quantity."""
     try:
         meaning = unit_meaning(unit)
     except ValueError:

@@ -1,9 +1,8 @@
-"""The elements of a MATLAB file of level 5, checked before scipy reads them.
+"""The elements of a MATLAB 5 file, checked before scipy reads them.
 
-A damaged file ends the process within scipy where a size, a type or a count does not fit: it
-follows them without a look at what is there. So each array is compared with what its class wants:
-sides, name, contents of known types, as many numbers, cells or fields as its sides state, and
-nothing behind them.
+scipy trusts the declared sizes, types and counts, so that a damaged file can crash the process. So
+each array is checked against its class: dimensions, name, contents of known types, as many numbers,
+cells or fields as its dimensions state, and no data after them.
 
 Reference: MathWorks, *MAT-File Format* (2019), chapter 1.
 """
@@ -19,9 +18,9 @@ _BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 1
 _CELL, _STRUCT, _OBJECT, _TEXT, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 4, 5, 16, 17  # of arrays
 _NUMERIC = range(6, 16)  # classes of arrays
 _COMPLEX = 0x800  # flag of an array
-_INFLATES = 1100  # deflate cannot shrink by more
-_MOST_SIDES = 32
-_MOST_WITHOUT_BYTES = 2**16  # letters of a text, or structs without fields
+_INFLATES = 1100  # largest compression ratio of deflate
+_MOST_DIMENSIONS = 32
+_MOST_WITHOUT_BYTES = 2**16  # characters of a text, or structs without fields
 _DEEPEST = 100
 
 
@@ -38,10 +37,10 @@ class _Element(NamedTuple):
 
 
 def checked_variables(content: bytes) -> list[MatlabVariable]:
-    """The variables of a file of level 5, in their order.
+    """The variables of a MATLAB 5 file, in order.
 
-    Raises `ValueError` for arrays that do not hold what their headers state, at any depth, and
-    for compressed ones without a valid checksum. Objects, which scipy passes over, are not checked.
+    Raises `ValueError` for arrays whose contents do not match their headers, at any depth, and for
+    compressed ones with an invalid checksum. Objects, which scipy skips, are not checked.
     """
     order = "<" if content[126:128] == b"IM" else ">"
     variables = []
@@ -55,7 +54,7 @@ def checked_variables(content: bytes) -> list[MatlabVariable]:
 
 
 def _inflated(body: memoryview, order: str) -> _Element:
-    """A compressed variable, inflated once its stated size can be there."""
+    """A compressed variable, inflated if its declared size is possible."""
     kind, size = struct.unpack(f"{order}II", zlib.decompressobj().decompress(body, 8))
     if size > _INFLATES * len(body):
         raise ValueError(f"it states {size} bytes that {len(body)} compressed ones cannot hold")
@@ -67,23 +66,25 @@ def _inflated(body: memoryview, order: str) -> _Element:
 
 
 def _elements(content: memoryview, order: str) -> Iterator[_Element]:
-    """The elements that stand one behind another, each wholly within `content`."""
-    at = 0
-    while at + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, at)
-        start = at + 8
-        if kind >> 16:  # a small one, within its tag
-            kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
+    """Consecutive elements, each entirely within `content`."""
+    position = 0
+    while position + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, position)
+        start = position + 8
+        if kind >> 16:  # small data element format
+            kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
         if kind not in _BYTES and kind not in (_MATRIX, _COMPRESSED):
             raise ValueError(f"it has an element of the type {kind}")
-        if start + size > len(content) or (start == at + 4 and (size > 4 or kind == _MATRIX)):
+        if start + size > len(content) or (start == position + 4 and (size > 4 or kind == _MATRIX)):
             raise ValueError(f"it has an element of {size} bytes where fewer are left")
         yield _Element(kind, content[start : start + size])
-        at += 8 if start == at + 4 else 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+        position += (
+            8 if start == position + 4 else 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
+        )
 
 
 def _variable(body: memoryview, order: str) -> MatlabVariable | None:
-    """A variable's name; None for what has no class."""
+    """A variable's name; None without a class."""
     parts = _elements(body, order)
     array_class = _flags(parts, order) & 0xFF
     if array_class == _OPAQUE:
@@ -91,14 +92,14 @@ def _variable(body: memoryview, order: str) -> MatlabVariable | None:
         return MatlabVariable(name, object_class or "object")
     if not array_class:
         return None
-    _sides(parts, order)
+    _dimensions(parts, order)
     name = _name(parts)
     _check_array(body, order, 0)
     return MatlabVariable(name)
 
 
 def _check_array(body: memoryview, order: str, depth: int) -> None:
-    """Raises `ValueError` unless an array holds what its class, flags and sides want."""
+    """Raises `ValueError` unless an array's contents match its class, flags and dimensions."""
     if depth > _DEEPEST:
         raise ValueError(f"it has arrays within arrays, more than {_DEEPEST} deep")
     if not body:
@@ -106,7 +107,7 @@ def _check_array(body: memoryview, order: str, depth: int) -> None:
     parts = _elements(body, order)
     flags = _flags(parts, order)
     array_class = flags & 0xFF
-    count = 1 if array_class == _OPAQUE else prod(_sides(parts, order))
+    count = 1 if array_class == _OPAQUE else prod(_dimensions(parts, order))
     _name(parts)
     if array_class in _NUMERIC:
         for _ in range(2 if flags & _COMPLEX else 1):
@@ -114,7 +115,7 @@ def _check_array(body: memoryview, order: str, depth: int) -> None:
                 raise ValueError(f"it has an array without its numbers, which are {count}")
     elif array_class == _TEXT:
         if not _numbers(parts) and count > _MOST_WITHOUT_BYTES:
-            raise ValueError(f"it has a text of {count} letters and no byte")
+            raise ValueError(f"it has a text of {count} characters and no byte")
     elif array_class == _SPARSE:
         for _ in range(4 if flags & _COMPLEX else 3):
             _numbers(parts)
@@ -129,13 +130,13 @@ def _check_array(body: memoryview, order: str, depth: int) -> None:
 
 
 def _inner_arrays(parts: Iterator[_Element], array_class: int, count: int, order: str) -> int:
-    """How many arrays stand in a cell array, a struct or an object."""
+    """Number of arrays in a cell array, a struct or an object."""
     if array_class == _CELL:
         return count
     if array_class == _FUNCTION:
         return 1
     if array_class == _OPAQUE:
-        _name(parts), _name(parts)  # of its system of types, and of its class
+        _name(parts), _name(parts)  # names of its type system and class
         return 1
     if array_class not in (_STRUCT, _OBJECT):
         raise ValueError(f"it has an array of the class {array_class}")
@@ -143,7 +144,7 @@ def _inner_arrays(parts: Iterator[_Element], array_class: int, count: int, order
         _name(parts)
     lengths = _integers(parts, order)
     if len(lengths) != 1 or lengths[0] < 1:
-        raise ValueError(f"it has a struct whose names have {lengths} letters")
+        raise ValueError(f"it has a struct whose names have {lengths} characters")
     fields = len(_text(parts)) // lengths[0]
     if not fields and count > _MOST_WITHOUT_BYTES:
         raise ValueError(f"it has {count} structs and no field")
@@ -151,11 +152,11 @@ def _inner_arrays(parts: Iterator[_Element], array_class: int, count: int, order
 
 
 def _next(parts: Iterator[_Element]) -> _Element:
-    """The next element, which must be there."""
-    found = next(parts, None)
-    if found is None:
+    """The next element; raises `ValueError` where there is none."""
+    element = next(parts, None)
+    if element is None:
         raise ValueError("it has an array without its contents")
-    return found
+    return element
 
 
 def _flags(parts: Iterator[_Element], order: str) -> int:
@@ -173,11 +174,11 @@ def _integers(parts: Iterator[_Element], order: str) -> tuple[int, ...]:
     return struct.unpack(f"{order}{len(content) // 4}i", content)
 
 
-def _sides(parts: Iterator[_Element], order: str) -> tuple[int, ...]:
-    sides = _integers(parts, order)
-    if not 2 <= len(sides) <= _MOST_SIDES or min(sides) < 0:
-        raise ValueError(f"it has an array with the sides {sides}")
-    return sides
+def _dimensions(parts: Iterator[_Element], order: str) -> tuple[int, ...]:
+    dimensions = _integers(parts, order)
+    if not 2 <= len(dimensions) <= _MOST_DIMENSIONS or min(dimensions) < 0:
+        raise ValueError(f"it has an array with the dimensions {dimensions}")
+    return dimensions
 
 
 def _text(parts: Iterator[_Element]) -> memoryview:
@@ -192,8 +193,8 @@ def _name(parts: Iterator[_Element]) -> str:
 
 
 def _numbers(parts: Iterator[_Element]) -> int:
-    """How many numbers the next element has."""
-    found = next(parts, None)
-    if found is None or found.kind not in _BYTES:
+    """Number of values in the next element."""
+    element = next(parts, None)
+    if element is None or element.kind not in _BYTES:
         raise ValueError("it has an array without its numbers")
-    return len(found.content) // _BYTES[found.kind]
+    return len(element.content) // _BYTES[element.kind]

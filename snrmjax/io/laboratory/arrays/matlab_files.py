@@ -10,16 +10,16 @@ from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.hdf5_tree import open_tree
 from snrmjax.io.laboratory.arrays.matlab_elements import MatlabVariable, checked_variables
 from snrmjax.io.laboratory.arrays.structs import file_of_tree
-from snrmjax.io.laboratory.arrays.value_tree import Node, held
+from snrmjax.io.laboratory.arrays.value_tree import Node, in_memory
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.numerics.facts import Fact
 
-_LARGEST = 2**29  # bytes of a file before v7.3, which is read whole, and numbers of its variables
+_LARGEST = 2**29  # bytes of a file before v7.3, which is read at once, and numbers in a variable
 
 
 def is_old_matlab(head: bytes, suffix: str) -> bool:
-    """Whether a file is of MATLAB before v7.3: v4 begins with a whole number below 5000."""
+    """Whether a file is MATLAB before v7.3; v4 begins with an integer below 5000."""
     first = (int.from_bytes(head[:4], order) for order in ("little", "big"))
     return head.startswith(b"MATLAB 5") or (suffix.lower() == ".mat" and min(first) < 5000)
 
@@ -33,18 +33,18 @@ def read_matlab(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
 
 
 def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:
-    """The variables of a file before v7.3 as a tree, and what was not read."""
+    """The variables of a file before v7.3 as a tree, and notes on those not read."""
     import scipy.io
 
-    size = path.stat().st_size
-    if size > _LARGEST:
+    n_bytes = path.stat().st_size
+    if n_bytes > _LARGEST:
         raise ValueError(
-            f"{path.name} has {size / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB "
-            "that are read of a file before v7.3: save it with `-v7.3`, which is read piece by "
-            "piece."
+            f"{path.name} has {n_bytes / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB "
+            "limit of a file before v7.3: save it with `-v7.3`, which is read block by "
+            "block."
         )
     with damaged_if_it_fails(path.name, "a MATLAB file"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of several objects, which all have no name
+        warnings.simplefilter("ignore")  # about several objects without a name
         content = path.read_bytes()
         if content.startswith(b"MATLAB 5"):
             variables = checked_variables(content)
@@ -64,13 +64,13 @@ def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:
 
 
 def _of_level_4(path: Path) -> list[MatlabVariable]:
-    """Variables of level 4. Raises `ValueError` for more numbers than are read."""
+    """Variables of a MATLAB 4 file. Raises `ValueError` above the size limit."""
     import scipy.io
 
     variables = scipy.io.whosmat(path)
-    for name, sides, _ in variables:
-        if np.prod(sides, dtype=float) > _LARGEST:
-            raise ValueError(f"{name} states {' by '.join(map(str, sides))} numbers")
+    for name, dimensions, _ in variables:
+        if np.prod(dimensions, dtype=float) > _LARGEST:
+            raise ValueError(f"{name} states {' by '.join(map(str, dimensions))} numbers")
     return [MatlabVariable(name) for name, _, _ in variables]
 
 
@@ -92,7 +92,7 @@ def _node(value: Any, name: str, notes: list[Fact]) -> Node | None:
             nodes = {key: _node(record[key], f"{name}.{key}", notes) for key in value.dtype.names}
             structs.append({key: node for key, node in nodes.items() if node is not None})
         return structs[0] if len(structs) == 1 else list(structs)
-    if value.dtype == object:  # a cell array: a list, or one of rows where it has two sides
+    if value.dtype == object:  # a cell array: a list, or a list of rows if two-dimensional
         if value.ndim == 2 and min(value.shape) > 1:
             return [_cells(row, name, notes) for row in value]
         return _cells(value.reshape(-1, order="F"), name, notes)
@@ -102,7 +102,7 @@ def _node(value: Any, name: str, notes: list[Fact]) -> Node | None:
     if value.dtype.kind not in "biufc":
         notes.append(Fact("not_read", name=name, why="type"))
         return None
-    return held(value) if value.size else None
+    return in_memory(value) if value.size else None
 
 
 def _cells(cells: np.ndarray, name: str, notes: list[Fact]) -> list[Node]:

@@ -1,6 +1,6 @@
-"""Octave's text format, as its `save` writes files unless another one is asked for.
+"""Octave's text format, the default of its `save`.
 
-Each variable is a line `# name:`, a line `# type:`, lines of sides, and the numbers.
+Each variable is a line `# name:`, a line `# type:`, lines of dimensions, and the numbers.
 """
 
 import re
@@ -12,7 +12,7 @@ import numpy as np
 from snrmjax.io.files import shown
 from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.structs import file_of_tree
-from snrmjax.io.laboratory.arrays.value_tree import Node, held
+from snrmjax.io.laboratory.arrays.value_tree import Node, in_memory
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.text.fields import text_of
 from snrmjax.numerics.facts import Fact
@@ -26,7 +26,7 @@ _NAME = "# name: "
 
 
 def is_octave_text(head: bytes) -> bool:
-    """Whether a file begins as Octave's text files do."""
+    """Whether a file begins like an Octave text file."""
     first, _, rest = head.lstrip(b"\xef\xbb\xbf\r\n ").partition(b"\n")
     return first.startswith(b"# Created by Octave") or (
         first.startswith(b"# name: ") and rest.startswith(b"# type: ")
@@ -46,7 +46,7 @@ def read_octave(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
 
 
 class _Lines:
-    """The lines of a file from the one on that is next."""
+    """The lines of a file with a reading position."""
 
     def __init__(self, lines: list[str], file: str) -> None:
         self._lines, self.file, self._at = lines, file, 0
@@ -54,11 +54,11 @@ class _Lines:
 
     @property
     def left(self) -> int:
-        """How many there are."""
+        """Number of remaining lines."""
         return len(self._lines) - self._at
 
     def find_name(self) -> bool:
-        """Go on to the next variable, if there is one."""
+        """Go to the next variable, if there is one."""
         while self.left and not self._lines[self._at].startswith(_NAME):
             self._at += 1
         return self.left > 0
@@ -66,7 +66,7 @@ class _Lines:
     def next(self) -> str:
         """The next line."""
         if not self.left:
-            raise ValueError(f"{self.file} is cut: it ends within a variable.")
+            raise ValueError(f"{self.file} is truncated: it ends within a variable.")
         self._at += 1
         return self._lines[self._at - 1]
 
@@ -75,7 +75,7 @@ class _Lines:
         return self.left > 0 and self._lines[self._at].startswith(f"# {key}")
 
     def stated(self, key: str) -> str:
-        """What the next line that is not empty states of a key."""
+        """The value of a key on the next line that is not empty."""
         line = self.next()
         while not line.strip() and self.left:
             line = self.next()
@@ -84,33 +84,33 @@ class _Lines:
         return line.partition(": ")[2].strip()
 
     def count(self, key: str) -> int:
-        """Likewise, a whole number that is not larger than what the file can hold."""
+        """The value of a key as a whole number, not larger than the file can hold."""
         word = self.stated(key)
         if not word.isdigit() or int(word) > max(self.left, len(self._lines)) * 2**16:
             raise self.damaged("a number of rows", word)
         return int(word)
 
     def damaged(self, wanted: str, line: str) -> ValueError:
-        """What is raised for a line that is not as it should be."""
+        """The error for an invalid line."""
         return ValueError(
             f"{self.file} is damaged: line {self._at} must be {wanted}, but is {shown(line)}."
         )
 
-    def sides(self) -> tuple[int, ...]:
-        """Rows and columns, or more sides."""
+    def dimensions(self) -> tuple[int, ...]:
+        """Numbers of rows and columns, or more dimensions."""
         if not self.peek("ndims"):
             return self.count("rows"), self.count("columns")
         self.count("ndims")
         line = self.next()
         words = line.split()
         if not words or not all(word.isdigit() for word in words):
-            raise self.damaged("the sides of an array", line)
+            raise self.damaged("the dimensions of an array", line)
         return tuple(int(word) for word in words)
 
     def numbers(self, n_lines: int, count: int, *, is_complex: bool) -> np.ndarray:
-        """Numbers of that many lines, each as many of them as all have."""
+        """The `count` numbers on the next `n_lines` lines."""
         if n_lines > self.left:
-            raise ValueError(f"{self.file} is cut: it ends within a variable.")
+            raise ValueError(f"{self.file} is truncated: it ends within a variable.")
         first, texts = self._at + 1, [self.next() for _ in range(n_lines)]
         text = " ".join(texts)
         if is_complex:
@@ -132,7 +132,7 @@ class _Lines:
 
 
 def _value(lines: _Lines, name: str, depth: int) -> Node | None:
-    """The value of a variable, of a field or of a cell; None with a note where it is not read."""
+    """The value of a variable, of a field or of a cell; None with a note if it is not read."""
     if depth > _DEEPEST:
         raise ValueError(f"{name} of {lines.file} nests too deeply.")
     kind = lines.stated("type").removeprefix("global ").removeprefix("float ")
@@ -144,7 +144,7 @@ def _value(lines: _Lines, name: str, depth: int) -> Node | None:
         return _range(lines, name)
     if kind == "bool" or re.fullmatch(rf"{_NUMBERS}scalar", kind):
         values = lines.numbers(1, 1, is_complex=kind.startswith("complex"))
-        return held(values.astype(bool) if kind == "bool" else values)
+        return in_memory(values.astype(bool) if kind == "bool" else values)
     if kind == "null_matrix" or re.fullmatch(rf"{_NUMBERS}matrix", kind):
         return _matrix(lines, kind)
     is_sparse = kind.startswith("sparse")
@@ -159,19 +159,19 @@ def _value(lines: _Lines, name: str, depth: int) -> Node | None:
 
 def _matrix(lines: _Lines, kind: str) -> Node | None:
     is_by_rows = not lines.peek("ndims")
-    sides = lines.sides()
-    count = int(np.prod(sides, dtype=object))
+    dimensions = lines.dimensions()
+    count = int(np.prod(dimensions, dtype=object))
     if not count:
         return None
     is_complex = kind.startswith("complex")
-    values = lines.numbers(sides[0] if is_by_rows else count, count, is_complex=is_complex)
+    values = lines.numbers(dimensions[0] if is_by_rows else count, count, is_complex=is_complex)
     values = values.astype(bool) if kind.startswith("bool") else values
-    return held(values.reshape(sides, order="C" if is_by_rows else "F"))
+    return in_memory(values.reshape(dimensions, order="C" if is_by_rows else "F"))
 
 
 def _text(lines: _Lines) -> Node:
     if lines.peek("ndims"):
-        lines.sides()
+        lines.dimensions()
         return lines.next()
     texts = []
     for _ in range(lines.count("elements")):
@@ -181,41 +181,41 @@ def _text(lines: _Lines) -> Node:
 
 
 def _range(lines: _Lines, name: str) -> Node:
-    """Numbers of one step: `# base, limit, increment`."""
+    """A range: `# base, limit, increment`."""
     keys = [word.strip() for word in lines.next().lstrip("# ").split(",")]
     line = lines.next()
     words = line.split()
     try:
-        said = {key: float(word) for key, word in zip(keys, words, strict=False)}
-        base, step = said["base"], said["increment"]
-        steps = said["length"] - 1 if "length" in said else (said["limit"] - base) / step
+        values = {key: float(word) for key, word in zip(keys, words, strict=False)}
+        base, step = values["base"], values["increment"]
+        steps = values["length"] - 1 if "length" in values else (values["limit"] - base) / step
     except (ValueError, KeyError, ZeroDivisionError) as error:
         raise lines.damaged(f"base, limit and increment of {name}", line) from error
     if not 0 <= steps < _LONGEST_RANGE:
         raise lines.damaged(f"a range of less than {_LONGEST_RANGE} numbers", line)
-    return held(base + step * np.arange(int(steps * (1 + 1e-12) + 1e-9) + 1))
+    return in_memory(base + step * np.arange(int(steps * (1 + 1e-12) + 1e-9) + 1))
 
 
 def _cell(lines: _Lines, name: str, depth: int) -> Node:
-    """A cell array: a list, or one of rows where it has two sides."""
-    sides = lines.sides()
-    count = int(np.prod(sides, dtype=object))
+    """A cell array: a list, or a list of rows if two-dimensional."""
+    dimensions = lines.dimensions()
+    count = int(np.prod(dimensions, dtype=object))
     if count > lines.left:
-        raise ValueError(f"{lines.file} is cut: it ends within {name}.")
+        raise ValueError(f"{lines.file} is truncated: it ends within {name}.")
     cells: list[Node] = []
     for k in range(count):
         lines.stated("name")
         node = _value(lines, f"{name}{{{k + 1}}}", depth + 1)
         cells.append([] if node is None else node)
-    if len(sides) == 2 and min(sides) > 1:
-        return [cells[row :: sides[0]] for row in range(sides[0])]
+    if len(dimensions) == 2 and min(dimensions) > 1:
+        return [cells[row :: dimensions[0]] for row in range(dimensions[0])]
     return cells
 
 
 def _struct(lines: _Lines, name: str, depth: int) -> dict[str, Node]:
-    """A struct, or an array of structs, whose fields are cells, as a list."""
+    """The fields of a struct; of a struct array, each field is a list."""
     if lines.peek("ndims"):
-        lines.sides()
+        lines.dimensions()
     fields: dict[str, Node] = {}
     for _ in range(lines.count("length")):
         key = lines.stated("name")

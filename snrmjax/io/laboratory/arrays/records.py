@@ -1,11 +1,11 @@
-"""Time records among named arrays: samples beside a sampling rate, a step or an even time."""
+"""Time records among named arrays: samples with a sampling rate, a step or an even time vector."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, get_args
 
 import numpy as np
 
-from snrmjax.io.laboratory.arrays.value_tree import ChannelPlace, Numbers, PlacedSamples
+from snrmjax.io.laboratory.arrays.value_tree import ArraySamples, ChannelPosition, Numbers
 from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference, unit_meaning
 from snrmjax.io.laboratory.printed_times import rate_of_printed_times
@@ -14,17 +14,22 @@ from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
 
-_SHORTEST = 64  # samples; shorter vectors beside a time are a table
+_SHORTEST = 64  # samples; shorter vectors with a time are a table
 _MOST_CHANNELS = 4096
-_LOOK = 4096  # samples of a long time vector that are looked at, at each of three places
-_EVEN = 1e-3  # of a step: what rounding leaves of an even time
+_LOOK = 4096  # samples checked of a long time vector, at each of three positions
+_EVEN = 1e-3  # of a step: tolerance for rounding of an even time
 _NAMES = frozenset({"channel", "channels", "channel_names", "names", "labels", "chan"})
-_SAID = {"unit": "unit", "quantity": "quantity", "point": "point", "direction": "direction"}
-_SAID |= {"units": "unit", "quantities": "quantity", "points": "point", "directions": "direction"}
+_METADATA = {"unit": "unit", "quantity": "quantity", "point": "point", "direction": "direction"}
+_METADATA |= {
+    "units": "unit",
+    "quantities": "quantity",
+    "points": "point",
+    "directions": "direction",
+}
 
 
-class FoundRecord(NamedTuple):
-    """The time record of a struct, the arrays that it used, and notes."""
+class StructRecord(NamedTuple):
+    """The time record of a struct, the arrays used, and notes."""
 
     record: TimeRecording | None = None
     used: frozenset[str] = frozenset()
@@ -41,59 +46,59 @@ class _Axis(NamedTuple):
 
 def recording_of(
     name: str, numbers: Mapping[str, Numbers], words: Mapping[str, Sequence[str]]
-) -> FoundRecord:
+) -> StructRecord:
     """The time record of a struct, if it has one.
 
-    Arguments: `words` are lists of text beside the arrays: names of channels, and lists called
+    Arguments: `words` are lists of text of the struct: names of channels, and lists called
     unit, quantity, point and direction.
     """
     axis = _time_axis(numbers)
     if axis is None:
-        return FoundRecord()
+        return StructRecord()
     if isinstance(axis, Fact):
-        return FoundRecord(notes=(axis,))
+        return StructRecord(notes=(axis,))
     sampled = {
         key: array
         for key, array in numbers.items()
-        if key not in axis.used and not array.is_complex and len(array.sides) < 3
+        if key not in axis.used and not array.is_complex and len(array.dimensions) < 3
     }
     lengths = [max(array.shape, default=1) for array in sampled.values()]
     long = axis.length or max(lengths, default=0)
     if long < _SHORTEST:
-        return FoundRecord()
+        return StructRecord()
     alike = {key: array for key, array in sampled.items() if long in array.shape}
     if any(role_of(key) == "frequency" and array.length == long for key, array in alike.items()):
-        return FoundRecord()
-    places: list[ChannelPlace] = []
+        return StructRecord()
+    positions: list[ChannelPosition] = []
     channels: list[Channel] = []
     for key, array in alike.items():
         side = array.shape.index(long)
         others = 1 if array.length is not None else array.size // long
         labels = _labels(words, others)
-        alone = others == 1 and len(alike) == 1  # what a text says, it says of this one
-        said = _said_of(words, others) if labels or alone else [{} for _ in range(others)]
+        alone = others == 1 and len(alike) == 1  # texts then describe this channel
+        metadata = _metadata_of(words, others) if labels or alone else [{} for _ in range(others)]
         for k in range(others):
-            by_place = key if others == 1 else f"{key}_{k + 1}"
-            places.append(ChannelPlace(array, side, k))
-            name_of = (labels[k] if labels else "") or by_place
-            channels.append(_channel(name_of, {**array.attributes, **said[k]}))
+            by_position = key if others == 1 else f"{key}_{k + 1}"
+            positions.append(ChannelPosition(array, side, k))
+            name_of = (labels[k] if labels else "") or by_position
+            channels.append(_channel(name_of, {**array.attributes, **metadata[k]}))
     names = [channel.name for channel in channels]
     if not channels or len(channels) > _MOST_CHANNELS:
-        return FoundRecord()
+        return StructRecord()
     if len(set(names)) < len(names):
         channels = [
             channel._replace(name=f"{channel.name} #{k + 1}") for k, channel in enumerate(channels)
         ]
     record = time_recording(
-        PlacedSamples(places, long),
+        ArraySamples(positions, long),
         channels,
         axis.rate,
         start_time=axis.start,
         name=name,
         notes=axis.notes,
     )
-    told = tuple(note for note in axis.notes if note.kind != "time_seen_in_places")
-    return FoundRecord(record, frozenset((*alike, *axis.used)), told)
+    notes = tuple(note for note in axis.notes if note.kind != "time_seen_in_places")
+    return StructRecord(record, frozenset((*alike, *axis.used)), notes)
 
 
 def _labels(words: Mapping[str, Sequence[str]], count: int) -> Sequence[str] | None:
@@ -102,34 +107,36 @@ def _labels(words: Mapping[str, Sequence[str]], count: int) -> Sequence[str] | N
         if key.lower() in _NAMES and len(word) == count:
             return word
     alike = [
-        word for key, word in words.items() if len(word) == count > 1 and key.lower() not in _SAID
+        word
+        for key, word in words.items()
+        if len(word) == count > 1 and key.lower() not in _METADATA
     ]
     return alike[0] if alike else None
 
 
-def _said_of(words: Mapping[str, Sequence[str]], count: int) -> list[dict[str, str]]:
-    """What lists of text say of each column of a matrix."""
-    said: list[dict[str, str]] = [{} for _ in range(count)]
+def _metadata_of(words: Mapping[str, Sequence[str]], count: int) -> list[dict[str, str]]:
+    """Metadata of each column of a matrix, from lists of text."""
+    metadata: list[dict[str, str]] = [{} for _ in range(count)]
     for key, word in words.items():
-        if key.lower() in _SAID and len(word) == count:
+        if key.lower() in _METADATA and len(word) == count:
             for k, text in enumerate(word):
-                said[k][_SAID[key.lower()]] = text
-    return said
+                metadata[k][_METADATA[key.lower()]] = text
+    return metadata
 
 
-def _channel(name: str, said: Mapping[str, str]) -> Channel:
-    """A channel with what the file says of it."""
-    unit = said.get("unit", "")
+def _channel(name: str, metadata: Mapping[str, str]) -> Channel:
+    """A channel with its metadata from the file."""
+    unit = metadata.get("unit", "")
     quantity, calibration = channel_meaning(unit)
     if quantity == "unknown" and level_reference(unit) is None:
         known: tuple[Quantity, ...] = get_args(Quantity)
-        quantity = next((name for name in known if name == said.get("quantity")), "unknown")
-    place = said.get("point", ""), said.get("direction", "")
-    return Channel(name, quantity, unit, calibration, *place)
+        quantity = next((name for name in known if name == metadata.get("quantity")), "unknown")
+    point_and_direction = metadata.get("point", ""), metadata.get("direction", "")
+    return Channel(name, quantity, unit, calibration, *point_and_direction)
 
 
 def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
-    """The rate of samples: stated, or of a time vector; a note where that one is uneven."""
+    """The sampling rate, as stated or from a time vector; a note where that is uneven."""
     single = {
         key: array for key, array in numbers.items() if array.size == 1 and not array.is_complex
     }
@@ -141,7 +148,7 @@ def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
     for key in single:
         if stated is None and (role := role_of(key)) in ("rate", "step"):
             dimension = "time" if role == "step" else "frequency"
-            value = _only(single[key]) * _size_of_unit(key, single[key], dimension)
+            value = _only(single[key]) * _unit_factor(key, single[key], dimension)
             value = 1 / value if role == "step" and value > 0 else value
             stated = (value, key) if np.isfinite(value) and value > 0 else None
     vectors = [
@@ -156,7 +163,7 @@ def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
         used = (stated[1], *starts, *vectors[:1])
         length = numbers[vectors[0]].length if vectors else None
         if vectors and not starts:
-            start = float(numbers[vectors[0]].stretch(0, 1)[0])
+            start = float(numbers[vectors[0]].part(0, 1)[0])
             start = start if np.isfinite(start) else 0.0
         return _Axis(length, stated[0], start, used)
     if not vectors:
@@ -165,9 +172,9 @@ def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
 
 
 def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
-    """Rate and start of a time vector, looked at whole or, where it is long, at three places."""
+    """Rate and start of a time vector, checked completely or, if long, at three positions."""
     n = array.length or 0
-    first, last = float(array.stretch(0, 1)[0]), float(array.stretch(n - 1, n)[0])
+    first, last = float(array.part(0, 1)[0]), float(array.part(n - 1, n)[0])
     step = (last - first) / (n - 1)
     uneven = Fact("uneven_time", name=key)
     if not (np.isfinite(step) and step > 0 and np.isfinite(1 / step)):
@@ -175,11 +182,11 @@ def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
     starts = sorted({0, max(0, n // 2 - _LOOK // 2), max(0, n - _LOOK)})
     parts = [np.arange(start, min(start + _LOOK, n)) for start in starts]
     at, where = np.unique(np.concatenate(parts), return_index=True)
-    read = [array.stretch(int(part[0]), int(part[-1]) + 1) for part in parts]
-    time = np.concatenate(read).astype(float)[where]
-    unit = _size_of_unit(key, array, "time")
+    values = [array.part(int(part[0]), int(part[-1]) + 1) for part in parts]
+    time = np.concatenate(values).astype(float)[where]
+    unit = _unit_factor(key, array, "time")
     notes = [Fact("time_seen_in_places", name=key)] if n > 3 * _LOOK else []
-    # Times of many seconds in few digits: rounding by the resolution of what is stored.
+    # Long times in single precision are rounded by its resolution.
     slack = _EVEN * step + 4e-16 * abs(last) + _single(array) * abs(last)
     if np.all(np.abs(time - (first + step * at)) <= slack):
         rate = 1 / (step * unit)
@@ -195,22 +202,22 @@ def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
     return _Axis(n, rate, first * unit, (key,), tuple(notes))
 
 
-def _size_of_unit(key: str, array: Numbers, dimension: str) -> float:
-    """A number of an array in s or Hz, by the unit that the file or the name states, if any."""
+def _unit_factor(key: str, array: Numbers, dimension: str) -> float:
+    """Factor to s or Hz from the unit stated by the file or the name; 1 without one."""
     try:
         meaning = unit_meaning(array.unit or label_of(key).unit)
     except ValueError:
         return 1.0
-    size = meaning.factor / HERTZ if dimension == "frequency" else meaning.factor
-    return size if meaning.dimension == dimension else 1.0
+    factor = meaning.factor / HERTZ if dimension == "frequency" else meaning.factor
+    return factor if meaning.dimension == dimension else 1.0
 
 
 def _single(array: Numbers) -> float:
     """Relative resolution of times that are stored in single precision, else 0."""
-    kind = array.stretch(0, 1).dtype
+    kind = array.part(0, 1).dtype
     return 1.2e-7 if kind == np.float32 else 0.0
 
 
 def _only(array: Numbers) -> float:
-    """A single number."""
+    """The value of a scalar array."""
     return float(array.read(tuple(slice(0, 1) for _ in array.shape)).reshape(-1)[0])

@@ -1,4 +1,4 @@
-"""What a struct of named arrays is: time records, frequency responses, tables of states."""
+"""Interpretation of structs of named arrays: time records, frequency responses, tables."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,13 +9,13 @@ import numpy as np
 from snrmjax.io.laboratory.arrays.even_axis import (
     EvenAxis,
     axis_keys,
+    frequency_dimension,
     in_hertz,
     is_mark,
-    side_of_lines,
     stated_axis,
 )
 from snrmjax.io.laboratory.arrays.records import recording_of
-from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
+from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, in_memory
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning, is_per_force
@@ -29,11 +29,11 @@ _HERTZ = 2 * np.pi
 _MOST_ENTRIES = 10_000
 _MOST_NAMED = 6
 _NUMBER = re.compile(r"[0-9]+([.,p_][0-9]+)*")
-_WIDEST = 64  # columns of a matrix that become columns of a table
+_WIDEST = 64  # most columns of a matrix that become table columns
 
 
 class Struct(NamedTuple):
-    """What a struct holds; tables by their place below it."""
+    """Contents of a struct; tables by their path below it."""
 
     recordings: list[TimeRecording]
     responses: list[FrequencyResponses]
@@ -44,13 +44,13 @@ class Struct(NamedTuple):
         """The tables by name."""
         return tuple(table._replace(name=name or "table") for name, table in self.tables.items())
 
-    def add(self, key: str, below: "Struct") -> None:
-        """Take in what a field holds."""
-        self.recordings.extend(below.recordings)
-        self.responses.extend(below.responses)
-        self.notes.extend(note for note in below.notes if note not in self.notes)
-        for place, table in below.tables.items():
-            self.tables[f"{key}.{place}" if place else key] = table
+    def add(self, key: str, nested: "Struct") -> None:
+        """Add the contents of a field."""
+        self.recordings.extend(nested.recordings)
+        self.responses.extend(nested.responses)
+        self.notes.extend(note for note in nested.notes if note not in self.notes)
+        for path, table in nested.tables.items():
+            self.tables[f"{key}.{path}" if path else key] = table
 
 
 def file_of_tree(
@@ -60,10 +60,10 @@ def file_of_tree(
     notes: Sequence[Fact],
     axis: EvenAxis | None = None,
 ) -> LaboratoryFile:
-    """All that is found in a tree.
+    """The contents of a tree.
 
-    Arguments: `notes` say what of the file is not in it; `axis` is that of responses without a
-    vector of frequencies.
+    Arguments: `notes` on parts of the file outside the tree; `axis` is that of responses without a
+    frequency vector.
     """
     contents = read_struct("", tree, axis=axis)
     known = [*notes, *contents.notes]
@@ -85,11 +85,10 @@ def read_struct(
     entry: bool = False,
     axis: EvenAxis | None = None,
 ) -> Struct:
-    """Everything in a struct and below it.
+    """The contents of a struct and of those below it.
 
-    Arguments: `name` as results are called; `entry` says that the struct is one of a list, whose
-    single numbers hold for each of its rows; `axis` is that of responses without a vector of
-    frequencies, unless the struct states one.
+    Arguments: `name` of the results; `entry` for a struct of a list, whose scalars apply to each of
+    its rows; `axis` is that of responses without a frequency vector, unless the struct states one.
     """
     contents = Struct([], [], {}, [])
     numbers = {key: node for key, node in fields.items() if isinstance(node, Numbers)}
@@ -124,18 +123,18 @@ def read_struct(
 
 
 def _joined_siblings(tables: Mapping[str, NumberTable]) -> dict[str, NumberTable]:
-    """Tables of structs whose names differ in a number alone, one a level, under one another."""
+    """Stack tables of structs whose names differ only by a number, one a level."""
     alike: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for place, table in tables.items():
-        plain = _NUMBER.sub("", place).strip("_ ")
-        alike.setdefault((plain, tuple(table.columns)), []).append(place)
+    for path, table in tables.items():
+        plain = _NUMBER.sub("", path).strip("_ ")
+        alike.setdefault((plain, tuple(table.columns)), []).append(path)
     joined: dict[str, NumberTable] = {}
-    for (plain, columns), places in alike.items():
-        if len(places) == 1 or not any(role_of(name) == "frequency" for name in columns):
-            joined |= {place: tables[place] for place in places}
+    for (plain, columns), paths in alike.items():
+        if len(paths) == 1 or not any(role_of(name) == "frequency" for name in columns):
+            joined |= {path: tables[path] for path in paths}
             continue
-        one = _joined([(k, tables[place]) for k, place in enumerate(places, 1)])
-        named = tuple(place for place in places for _ in range(tables[place].n_rows))
+        one = _joined([(k, tables[path]) for k, path in enumerate(paths, 1)])
+        named = tuple(path for path in paths for _ in range(tables[path].n_rows))
         joined[plain] = one._replace(words={**one.words, "entry name": named})
     return joined
 
@@ -143,7 +142,7 @@ def _joined_siblings(tables: Mapping[str, NumberTable]) -> dict[str, NumberTable
 def _entries(
     name: str, structs: Sequence[Mapping[str, Node]], axis: EvenAxis | None = None
 ) -> Struct:
-    """A list with one struct a level: its tables under one another, with the entry's number."""
+    """A list with one struct a level: tables stacked, with the entry's number."""
     if len(structs) > _MOST_ENTRIES:
         raise ValueError(f"{name} is a list of {len(structs)} entries, more than {_MOST_ENTRIES}.")
     several = len(structs) > 1
@@ -151,17 +150,17 @@ def _entries(
     parts: dict[str, list[tuple[int, NumberTable]]] = {}
     for k, fields in enumerate(structs, 1):
         path = f"{name}({k})" if several else name
-        below = read_struct(path, fields, entry=several, axis=axis)
-        contents.add("", below._replace(tables={}))
-        for place, table in below.tables.items():
-            parts.setdefault(place, []).append((k, table))
-    for place, numbered in parts.items():
-        contents.tables[place] = _joined(numbered) if several else numbered[0][1]
+        nested = read_struct(path, fields, entry=several, axis=axis)
+        contents.add("", nested._replace(tables={}))
+        for path, table in nested.tables.items():
+            parts.setdefault(path, []).append((k, table))
+    for path, numbered in parts.items():
+        contents.tables[path] = _joined(numbered) if several else numbered[0][1]
     return contents
 
 
 def _joined(parts: Sequence[tuple[int, NumberTable]]) -> NumberTable:
-    """Tables of several entries under one another; NaN where an entry lacks a column."""
+    """Stacked tables of several entries; NaN where an entry lacks a column."""
     tables = [table for _, table in parts]
     names = list(dict.fromkeys(key for table in tables for key in table.columns))
     entry = np.repeat([float(k) for k, _ in parts], [table.n_rows for table in tables])
@@ -207,7 +206,7 @@ def _read_numbers(
             groups.setdefault(array.length, {})[key] = array
     for key, array in rest.items():
         if array.length is None and array.size:
-            _spread(key, array, groups, words, contents.notes)
+            _matrix_columns(key, array, groups, words, contents.notes)
     if not groups and single and (entry or any(role_of(key) == "frequency" for key in single)):
         groups[1] = {}
     for n, group in groups.items():
@@ -222,52 +221,57 @@ def _read_numbers(
             if (len(word) == n or (entry and len(word) == 1)) and key not in columns
         }
         in_order = {key: columns[key] for key in (*group, *repeated)}
-        place = "" if len(groups) == 1 else f"rows{n}"
-        contents.tables[place] = NumberTable("", in_order, units, texts)
+        path = "" if len(groups) == 1 else f"rows{n}"
+        contents.tables[path] = NumberTable("", in_order, units, texts)
 
 
 def _listed_units(
     group: Mapping[str, Numbers], words: Mapping[str, Sequence[str]]
 ) -> dict[str, str]:
-    """Units that a list beside the columns states, one a column in their order."""
+    """Units from a list with one entry per column, in order."""
     for key, listed in words.items():
         if key.lower() in ("unit", "units") and len(listed) == len(group):
             return {name: unit for name, unit in zip(group, listed, strict=True) if unit}
     return {}
 
 
-def _spread(
+def _matrix_columns(
     key: str,
     array: Numbers,
     groups: dict[int, dict[str, Numbers]],
     words: Mapping[str, Sequence[str]],
     notes: list[Fact],
 ) -> None:
-    """A matrix as columns: beside vectors of one of its sides, else along its longer side."""
-    sides = array.sides
-    axis = 0 if sides[0] in groups or (sides[1] not in groups and sides[0] >= sides[1]) else 1
-    if len(sides) != 2 or sides[1 - axis] > _WIDEST:
-        notes.append(Fact("not_a_table", name=key, sides=tuple(sides)))
+    """A matrix as columns, along a dimension shared with vectors, else along the longer one."""
+    dimensions = array.dimensions
+    axis = (
+        0
+        if dimensions[0] in groups
+        or (dimensions[1] not in groups and dimensions[0] >= dimensions[1])
+        else 1
+    )
+    if len(dimensions) != 2 or dimensions[1 - axis] > _WIDEST:
+        notes.append(Fact("not_a_table", name=key, sides=tuple(dimensions)))
         return
-    n, width = sides[axis], sides[1 - axis]
-    values = array.all(key).reshape(sides)
+    n, width = dimensions[axis], dimensions[1 - axis]
+    values = array.all(key).reshape(dimensions)
     values = values if axis == 0 else values.T
     labels = next((word for word in words.values() if len(word) == width), None)
     for k in range(width):
         label = f"{key}.{labels[k]}" if labels else f"{key}_{k + 1}"
-        groups.setdefault(n, {})[label] = held(values[:, k], array.attributes)
+        groups.setdefault(n, {})[label] = in_memory(values[:, k], array.attributes)
 
 
 def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None:
-    """Matrices of states by levels as one struct a level, or None where they are none.
+    """Matrices of states by levels as one struct a level; None for other arrays.
 
-    They are where two matrices have one shape, and the frequency or a force is one of them or
-    stands once a column.
+    Condition: two matrices have one shape, and the frequency or a force is one of them or has one
+    value per column.
     """
     shapes = [
         array.shape for array in numbers.values() if len(array.shape) == 2 and min(array.shape) > 1
     ]
-    shape = next((sides for sides in shapes if shapes.count(sides) > 1), None)
+    shape = next((dimensions for dimensions in shapes if shapes.count(dimensions) > 1), None)
     names = {key: role_of(key) for key in numbers}
     frequency = [key for key in numbers if names[key] == "frequency"]
     if shape is None or max(shape) > _MOST_ENTRIES or not frequency:
@@ -289,11 +293,11 @@ def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None
         for key, values in arrays.items():
             words = numbers[key].attributes
             if key in matrices:
-                fields[key] = held(np.take(values, k, axis=1 - axis), words)
+                fields[key] = in_memory(np.take(values, k, axis=1 - axis), words)
             elif key in a_column:
-                fields[key] = held(values.reshape(-1)[k : k + 1], words)
+                fields[key] = in_memory(values.reshape(-1)[k : k + 1], words)
             elif numbers[key].length in (shape[axis], 1):
-                fields[key] = held(values.reshape(-1), words)
+                fields[key] = in_memory(values.reshape(-1), words)
         structs.append(fields)
     return structs
 
@@ -301,62 +305,62 @@ def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None
 def _responses(
     name: str, numbers: Mapping[str, Numbers], contents: Struct, even: EvenAxis | None
 ) -> dict[str, Numbers]:
-    """Complex matrices along a frequency axis as frequency responses; returns what is left.
+    """Complex matrices along a frequency axis as frequency responses; returns the other arrays.
 
-    Without a vector of frequencies `even` is the axis, of a complex vector, too.
+    Without a frequency vector, `even` is the axis, also for a complex vector.
     """
-    left = dict(numbers)
+    remaining = dict(numbers)
     axes = [
         key
         for key, array in numbers.items()
         if role_of(key) == "frequency" and array.length and array.length > 1
     ]
-    taken: set[int] = set()
+    line_counts: set[int] = set()
     single = axis_keys(numbers)
     for key, array in numbers.items():
-        sides = array.sides
-        if not array.is_complex or len(sides) not in (1, 2, 3):
+        dimensions = array.dimensions
+        if not array.is_complex or len(dimensions) not in (1, 2, 3):
             continue
-        axis = next((other for other in axes if numbers[other].length in sides), None)
-        lines = side_of_lines(sides) if axis is None else None
-        if axis is not None and len(sides) > 1:
+        axis = next((other for other in axes if numbers[other].length in dimensions), None)
+        lines = frequency_dimension(dimensions) if axis is None else None
+        if axis is not None and len(dimensions) > 1:
             unit = numbers[axis].unit or label_of(axis).unit
             hertz = numbers[axis].vector(axis).astype(float) * in_hertz(unit)
         elif lines is not None and even is not None:
             hertz = even.hertz(lines)
         else:
-            if lines is not None and (len(sides) > 1 or not axes):
+            if lines is not None and (len(dimensions) > 1 or not axes):
                 contents.notes.append(Fact("responses_without_axis", name=key, n=lines))
             continue
         if not (np.isfinite(hertz).all() and hertz[0] >= 0 and np.all(np.diff(hertz) > 0)):
             continue
-        values = np.moveaxis(array.all(key).reshape(sides), sides.index(hertz.size), -1)
+        values = np.moveaxis(array.all(key).reshape(dimensions), dimensions.index(hertz.size), -1)
         values = values.reshape(values.shape[0] if values.ndim > 1 else 1, -1, hertz.size)
         if not np.isfinite(values).any() or np.isinf(values).any():
             continue
         quantity, calibration = channel_meaning(array.unit)
-        above = Channel("", quantity, array.unit, calibration)
-        below = Channel("", "force", "N") if is_per_force(array.unit) else Channel("")
+        numerator = Channel("", quantity, array.unit, calibration)
+        denominator = Channel("", "force", "N") if is_per_force(array.unit) else Channel("")
         contents.responses.append(
             frequency_responses(
                 hertz * _HERTZ,
                 values,
-                [above._replace(name=f"{key}.{k + 1}") for k in range(values.shape[0])],
-                [below._replace(name=f"reference {k + 1}") for k in range(values.shape[1])],
+                [numerator._replace(name=f"{key}.{k + 1}") for k in range(values.shape[0])],
+                [denominator._replace(name=f"reference {k + 1}") for k in range(values.shape[1])],
                 name=f"{name}.{key}" if name else key,
                 notes=[Fact("responses_along_first_side")],
             )
         )
         if axis is None and even is not None:
-            said = {"start": even.start, "step": even.step, "stop": float(hertz[-1])}
-            contents.notes.append(Fact("even_axis", name=key, **said))
-            left = {other: array for other, array in left.items() if other not in single}
-        left.pop(key)
-        taken.add(hertz.size)
-    # What marks the lines of responses is no response; nor are their frequencies alone.
-    marks = {key: array for key, array in left.items() if array.length in taken}
+            settings = {"start": even.start, "step": even.step, "stop": float(hertz[-1])}
+            contents.notes.append(Fact("even_axis", name=key, **settings))
+            remaining = {other: array for other, array in remaining.items() if other not in single}
+        remaining.pop(key)
+        line_counts.add(hertz.size)
+    # Flags of the lines of responses, and frequencies alone, are no table.
+    marks = {key: array for key, array in remaining.items() if array.length in line_counts}
     if all(key in axes or is_mark(key, array) for key, array in marks.items()):
         others = [key for key in marks if key not in axes]
         contents.notes.extend(Fact("not_read", name=key, why="marks") for key in others)
-        left = {key: array for key, array in left.items() if key not in marks}
-    return left
+        remaining = {key: array for key, array in remaining.items() if key not in marks}
+    return remaining

@@ -1,4 +1,4 @@
-"""Named arrays of a file as a tree of structs, lists, text and numbers that are read when asked."""
+"""Named arrays of a file as a tree of structs, lists, text and numbers that are read on demand."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Union
@@ -9,13 +9,13 @@ from jaxtyping import Num
 from snrmjax.measure.recordings.time_recording import AbstractSamples
 
 Selection = tuple[slice, ...]
-_MOST_HELD = 2**24  # numbers of an array that are read at once: 128 MiB of float64
+_MOST_IN_MEMORY = 2**24  # largest array (numbers) that is read at once: 128 MiB of float64
 
 
 class Numbers(NamedTuple):
-    """An array of a file: its shape is known, its numbers are read when asked.
+    """An array of a file: its shape is known, its numbers are read on demand.
 
-    `read` takes one slice an axis. `attributes` are words that the file has for it: "unit",
+    `read` takes one slice an axis. `attributes` are metadata in the file: "unit",
     "quantity", "point", "direction".
     """
 
@@ -26,39 +26,39 @@ class Numbers(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers."""
+        """Number of elements."""
         return int(np.prod(self.shape, dtype=object)) if self.shape else 1
 
     @property
-    def sides(self) -> list[int]:
-        """The lengths of its axes but for those of 1."""
+    def dimensions(self) -> list[int]:
+        """The lengths of its axes, except those of 1."""
         return [n for n in self.shape if n != 1]
 
     @property
     def length(self) -> int | None:
         """Length of a vector (a row, a column, or of one axis), else None."""
-        return None if len(self.sides) > 1 else (self.sides or [1])[0]
+        return None if len(self.dimensions) > 1 else (self.dimensions or [1])[0]
 
     @property
     def unit(self) -> str:
-        """The file's word for the unit."""
+        """The unit as written in the file."""
         return self.attributes.get("unit", "")
 
     def all(self, name: str) -> Num[np.ndarray, "..."]:
-        """All of it, integers and booleans as they are; refused by its name where that is much."""
-        if self.size > _MOST_HELD:
+        """The whole array, types unchanged. Raises `ValueError` above the size limit."""
+        if self.size > _MOST_IN_MEMORY:
             raise ValueError(
-                f"{name} has {self.size} numbers, more than a table may hold ({_MOST_HELD}): keep "
-                "long records as time records with an even time vector or a sampling rate."
+                f"{name} has {self.size} numbers, more than a table may hold ({_MOST_IN_MEMORY}): "
+                "keep long records as time records with an even time vector or a sampling rate."
             )
         return self.read(tuple(slice(0, n) for n in self.shape))
 
     def vector(self, name: str) -> Num[np.ndarray, " row"]:
-        """A vector, whichever way it lies."""
+        """The array as a vector, row or column."""
         return self.all(name).reshape(-1)
 
-    def stretch(self, start: int, stop: int) -> Num[np.ndarray, " row"]:
-        """A part of a vector, whichever way it lies."""
+    def part(self, start: int, stop: int) -> Num[np.ndarray, " row"]:
+        """A part of a vector, row or column."""
         at = tuple(slice(start, stop) if n != 1 else slice(0, 1) for n in self.shape)
         return self.read(at).reshape(-1)
 
@@ -66,54 +66,56 @@ class Numbers(NamedTuple):
 Node = Union[Numbers, str, list["Node"], dict[str, "Node"]]  # noqa: UP007
 
 
-def held(values: Num[np.ndarray, "..."], attributes: Mapping[str, str] | None = None) -> Numbers:
-    """Numbers that are in memory already."""
+def in_memory(
+    values: Num[np.ndarray, "..."], attributes: Mapping[str, str] | None = None
+) -> Numbers:
+    """Numbers from an array in memory."""
     array = np.asarray(values)
     return Numbers(
         array.shape, lambda at: array[at], bool(np.iscomplexobj(array)), dict(attributes or {})
     )
 
 
-class ChannelPlace(NamedTuple):
-    """Where a channel's samples lie: an array, its axis of samples, and the place on the other."""
+class ChannelPosition(NamedTuple):
+    """Position of a channel's samples: array, sample axis, and index on the other axis."""
 
     numbers: Numbers
     axis: int
     other: int
 
 
-class PlacedSamples(AbstractSamples):
-    """Channels in vectors and in columns of matrices of a file."""
+class ArraySamples(AbstractSamples):
+    """Samples of channels in vectors or matrices of a file."""
 
-    def __init__(self, places: Sequence[ChannelPlace], n_samples: int) -> None:
-        self._places, self._samples = tuple(places), n_samples
+    def __init__(self, positions: Sequence[ChannelPosition], n_samples: int) -> None:
+        self._positions, self._samples = tuple(positions), n_samples
 
     @property
     def shape(self) -> tuple[int, int]:
         """Channels and samples."""
-        return len(self._places), self._samples
+        return len(self._positions), self._samples
 
     def read(
         self, channels: Sequence[int], start: int, stop: int
     ) -> Num[np.ndarray, "channel sample"]:
-        """A stretch of some channels; those of one matrix are read together."""
-        chosen = [self._places[k] for k in channels]
+        """Samples of some channels; those of one matrix are read together."""
+        chosen = [self._positions[k] for k in channels]
         rows: dict[int, np.ndarray] = {}
-        for k, place in enumerate(chosen):
+        for k, position in enumerate(chosen):
             if k in rows:
                 continue
             alike = {
                 m: sibling.other
                 for m, sibling in enumerate(chosen)
-                if sibling.numbers is place.numbers
+                if sibling.numbers is position.numbers
             }
-            at = [slice(0, n) for n in place.numbers.shape]
-            at[place.axis] = slice(start, stop)
+            at = [slice(0, n) for n in position.numbers.shape]
+            at[position.axis] = slice(start, stop)
             first = min(alike.values())
             if len(at) > 1:
-                at[1 - place.axis] = slice(first, max(alike.values()) + 1)
-            block = place.numbers.read(tuple(at))
+                at[1 - position.axis] = slice(first, max(alike.values()) + 1)
+            block = position.numbers.read(tuple(at))
             for m, other in alike.items():
                 is_matrix = len(at) > 1
-                rows[m] = np.take(block, other - first, 1 - place.axis) if is_matrix else block
+                rows[m] = np.take(block, other - first, 1 - position.axis) if is_matrix else block
         return np.stack([rows[k] for k in range(len(chosen))])

@@ -1,1 +1,1 @@
-"""Texts of laboratories: separated columns, LabVIEW measurement files."""
+"""Laboratory text files: separated columns, LabVIEW measurement files."""

@@ -1,4 +1,4 @@
-"""Columns of a text: numbers, also with thousands and of another decimal mark, or words."""
+"""Columns of a text: numbers, also with thousands separators or decimal commas, or words."""
 
 import io
 import re
@@ -32,26 +32,26 @@ def read_columns(
 ) -> dict[str, np.ndarray | list[str]]:
     """Columns of numbers or of text by name.
 
-    Raises `ValueError` for rows of another length, a text among numbers, and numbers that are
-    decimals or thousands where nothing says which.
+    Raises `ValueError` for rows of another length, a text among numbers, and ambiguous
+    decimal and thousands marks.
     """
     if stated.decimal is None:
-        _refuse_either(rows, separator, file)
+        _refuse_ambiguous(rows, separator, file)
     for k, line in rows:
-        bare = line.rstrip(separator + " ") if separator != "\t" else line.rstrip()
-        least = len(line.split()) if separator == " " else bare.count(separator) + 1
+        stripped = line.rstrip(separator + " ") if separator != "\t" else line.rstrip()
+        least = len(line.split()) if separator == " " else stripped.count(separator) + 1
         most = least if separator == " " else line.count(separator) + 1
         if (least > width or most < width) and '"' not in line:
             raise ValueError(
                 f"row {k} of {file} has {least} fields, but the first row of numbers has {width}."
             )
-    bare_rows = [_cut(line, separator, width) for _, line in rows]
-    # From 3.1 on pandas reads numbers to the last bit by itself, and says so of the option.
+    stripped_rows = [_cut(line, separator, width) for _, line in rows]
+    # From 3.1 on pandas reads numbers exactly by default and warns about the option.
     exact = tuple(map(int, pandas.__version__.split(".")[:2])) >= (3, 1)
     precision: dict[str, Any] = {} if exact else {"float_precision": "round_trip"}
     try:
         table = pandas.read_csv(
-            io.StringIO("\n".join(bare_rows)),
+            io.StringIO("\n".join(stripped_rows)),
             sep=r"\s+" if separator == " " else separator,
             decimal="." if decimal == "point" else ",",
             header=None,
@@ -60,30 +60,30 @@ def read_columns(
             skipinitialspace=True,
             **precision,
         )
-    except (ValueError, OverflowError) as error:  # pandas' own errors are among them
-        said = " ".join(str(error).split())[:160]
-        raise ValueError(f"{file} is damaged or no table of text ({said}).") from error
+    except (ValueError, OverflowError) as error:  # includes the errors of pandas
+        message = " ".join(str(error).split())[:160]
+        raise ValueError(f"{file} is damaged or no table of text ({message}).") from error
     columns: dict[str, np.ndarray | list[str]] = {}
     for name, column in table.items():
         if column.dtype.kind in "biuf":
             columns[name] = values = column.to_numpy(dtype=float, na_value=np.nan)
-            place = list(names).index(name)
+            column_index = list(names).index(name)
             is_asked = stated.decimal is None and column.dtype.kind == "f"
             if is_asked and _may_have_thousands(values):
-                fields = {k: _field(line, separator, place) for k, line in rows}
+                fields = {k: _field(line, separator, column_index) for k, line in rows}
                 _refuse_thousands(fields, decimal, name, file)
             continue
-        there = zip(rows, column, column.notna(), strict=True)
-        texts = {k: str(word) for (k, _), word, is_there in there if is_there}
-        found = _numbers_of_texts(texts, decimal, name, file, notes)
-        words = [k for k in texts if k not in found]
+        entries = zip(rows, column, column.notna(), strict=True)
+        texts = {k: str(word) for (k, _), word, is_present in entries if is_present}
+        numbers = _numbers_of_texts(texts, decimal, name, file, notes)
+        words = [k for k in texts if k not in numbers]
         if 2 * len(words) < len(rows):
             if words:
                 raise ValueError(
                     f"column {name} must be numbers, but row {words[0]} of {file} has "
                     f"{shown(texts[words[0]])}."
                 )
-            columns[name] = np.array([found.get(k, np.nan) for k, _ in rows])
+            columns[name] = np.array([numbers.get(k, np.nan) for k, _ in rows])
         else:
             columns[name] = [texts.get(k, "") for k, _ in rows]
     return columns
@@ -92,41 +92,42 @@ def read_columns(
 def _numbers_of_texts(
     texts: Mapping[int, str], decimal: str, name: str, file: str, notes: list[Fact]
 ) -> dict[int, float]:
-    """The numbers among texts that are no plain ones, by their rows; with thousands, or of a
-    column with the other decimal mark."""
+    """Numbers in texts by row, with thousands separators or in a column with the other decimal
+    mark."""
     other = "comma" if decimal == "point" else "point"
-    found = {k: number_in(text, decimal, thousands=True) for k, text in texts.items()}
+    numbers = {k: number_in(text, decimal, thousands=True) for k, text in texts.items()}
     foreign = [
         k
         for k, text in texts.items()
-        if found[k] is None and number_in(text, other, thousands=True) is not None
+        if numbers[k] is None and number_in(text, other, thousands=True) is not None
     ]
     if foreign:
         by_other = {k: number_in(text, other, thousands=True) for k, text in texts.items()}
-        odd = next((k for k in texts if found[k] is not None and by_other[k] is None), None)
+        odd = next((k for k in texts if numbers[k] is not None and by_other[k] is None), None)
         if odd is not None:
             raise ValueError(
                 f"column {name} of {file} has decimal commas and decimal points: row {odd} has "
                 f"{shown(texts[odd])}, row {foreign[0]} {shown(texts[foreign[0]])}."
             )
-        found, decimal = by_other, other
+        numbers, decimal = by_other, other
         notes.append(Fact("other_decimal", name=name, decimal=decimal))
     grouped = [k for k, text in texts.items() if has_thousands(text, decimal)]
     if grouped:
         first = grouped[0]
-        notes.append(Fact("thousands", name=name, text=texts[first], number=found[first]))
-    values = {k: value for k, value in found.items() if value is not None}
+        notes.append(Fact("thousands", name=name, text=texts[first], number=numbers[first]))
+    values = {k: value for k, value in numbers.items() if value is not None}
     for k in texts.keys() - values.keys():  # "inf"
         if (value := pandas.to_numeric(texts[k], errors="coerce")) == value:
             values[k] = float(value)
     return values
 
 
-def _refuse_either(rows: list[tuple[int, str]], separator: str, file: str) -> None:
-    """Raise `ValueError` where nothing in a file says whether "1.250" is 1.25 or 1250.
+def _refuse_ambiguous(rows: list[tuple[int, str]], separator: str, file: str) -> None:
+    """Raise `ValueError` where a file leaves open whether "1.250" is 1.25 or 1250.
 
-    Every number is a whole one below 1000, or has a mark and three digits behind it; where all
-    have, they are decimals of three digits, as are points where commas separate columns.
+    That is so if every number is whole and below 1000 or has a mark before three digits, and both
+    occur. Numbers that all have three digits after the mark are decimals, as are those with points
+    in a comma-separated file.
     """
     marks = "," if separator == "," else ".,"
     if not any(mark in line for _, line in rows for mark in marks):
@@ -145,45 +146,45 @@ def _refuse_either(rows: list[tuple[int, str]], separator: str, file: str) -> No
         row, field = first
         raise ValueError(
             f"is {field} in row {row} of {file} {float(field.replace(',', '.')):g} or "
-            f"{re.sub('[.,]', '', field)}? None of its other numbers says so: --decimal point or "
+            f"{re.sub('[.,]', '', field)}? Its other numbers do not show it: --decimal point or "
             "comma."
         )
 
 
 def _may_have_thousands(values: np.ndarray) -> bool:
-    """Whether a column of numbers may be one of thousands that were read as decimals."""
-    size = np.abs(values[np.isfinite(values)])
-    thousandths = 1e3 * size
+    """Whether thousands in a column may have been read as decimals."""
+    magnitude = np.abs(values[np.isfinite(values)])
+    thousandths = 1e3 * magnitude
     return bool(
-        size.size
-        and size.max() < 1000
-        and not np.any((size > 0) & (size < 1))
+        magnitude.size
+        and magnitude.max() < 1000
+        and not np.any((magnitude > 0) & (magnitude < 1))
         and np.all(np.abs(thousandths - np.round(thousandths)) < 1e-6)
     )
 
 
 def _refuse_thousands(fields: Mapping[int, str], decimal: str, name: str, file: str) -> None:
-    """Raise `ValueError` for "998" and "1.000" in one column: no program writes 1 so beside 998."""
+    """Raise `ValueError` for "998" and "1.000" in one column, whose formats contradict."""
     mark = "." if decimal == "point" else ","
-    either = {k: field for k, field in fields.items() if may_be_thousands(field, mark)}
-    whole = [field for k, field in fields.items() if k not in either and field]
-    row = next((k for k, field in either.items() if field.endswith("0")), None)
+    ambiguous = {k: field for k, field in fields.items() if may_be_thousands(field, mark)}
+    whole = [field for k, field in fields.items() if k not in ambiguous and field]
+    row = next((k for k, field in ambiguous.items() if field.endswith("0")), None)
     if whole and row is not None and not any(mark in field for field in whole):
         raise ValueError(
-            f"is {either[row]} in row {row} of {file} a thousand or more? Column {name} has "
-            f"{whole[0]}, too, as if {shown(mark)} stood between thousands, and is elsewhere the "
+            f"is {ambiguous[row]} in row {row} of {file} a thousand or more? Column {name} has "
+            f"{whole[0]}, too, as if {shown(mark)} separated thousands, and is elsewhere the "
             "decimal mark: --decimal point or comma."
         )
 
 
-def _field(line: str, separator: str, place: int) -> str:
-    """One field of a line, empty where it has none."""
+def _field(line: str, separator: str, column_index: int) -> str:
+    """One field of a line; empty if missing."""
     fields = fields_of(line, separator)
-    return fields[place] if place < len(fields) else ""
+    return fields[column_index] if column_index < len(fields) else ""
 
 
 def _cut(line: str, separator: str, width: int) -> str:
-    """A row without what separators at its end add to its columns."""
+    """A row without the empty columns of trailing separators."""
     if separator == " " or line.count(separator) < width or '"' in line:
         return line
     return separator.join(line.split(separator)[:width])

@@ -1,4 +1,4 @@
-"""LabVIEW measurement files (.lvm): their header states separator, decimal mark, steps and units.
+"""LabVIEW measurement files (.lvm): the header gives separator, decimal mark, steps and units.
 
 Source: NI, "LabVIEW Measurement File format specification" (tutorial 4139).
 """
@@ -10,23 +10,23 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.io.laboratory.arrays.structs import read_struct
-from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, held
+from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, in_memory
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.physical_units import channel_meaning
 from snrmjax.io.laboratory.printed_times import rate_between
 from snrmjax.io.laboratory.shared_clock import SharedAxis, TimeAxis, note_on_shift, shared_axes
 from snrmjax.io.laboratory.text.fields import SEPARATORS, fields_of, number_in, text_of
 from snrmjax.measure.recordings.channels import Channel
-from snrmjax.measure.recordings.time_recording import HeldSamples, TimeRecording, time_recording
+from snrmjax.measure.recordings.time_recording import SamplesInMemory, TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
 
 _END = "***End_of_Header***"
 _X = "X_Value"
-_EVEN = 1e-3  # of a step: what rounding leaves of an even abscissa
+_EVEN = 1e-3  # of a step: tolerance for rounding of an even abscissa
 
 
 class _Style(NamedTuple):
-    """How the file says that it is written."""
+    """Format stated by the file header."""
 
     file: str
     separator: str
@@ -34,7 +34,7 @@ class _Style(NamedTuple):
     x_columns: str  # No, One, Multi
 
     def number(self, field: str, what: str) -> float:
-        """A number, whatever its decimal mark: old headers have points beside commas."""
+        """A number with either decimal mark: old headers mix points and commas."""
         value = number_in(field, "point")
         value = number_in(field, "comma") if value is None else value
         if value is None:
@@ -67,31 +67,33 @@ def read_labview_text(path: Path) -> LaboratoryFile:
         name = path.stem if len(segments) == 1 else f"segment {k}"
         columns, words, further = _columns(header, rows, style)
         notes += further
-        loose: dict[str, Node] = {}
-        waves: dict[int, TimeAxis] = {}
+        separate: dict[str, Node] = {}
+        waveforms: dict[int, TimeAxis] = {}
         for number, column in enumerate(columns):
             if _is_even(column) and column.dimension.lower() in ("time", ""):
-                waves[number] = TimeAxis(column.step, column.start, len(column.values))
+                waveforms[number] = TimeAxis(column.step, column.start, len(column.values))
                 continue
             is_time = column.dimension.lower() in ("time", "")
             axis = "time" if is_time else column.dimension.lower()
             x = column.abscissa
             x = column.start + column.step * np.arange(len(column.values)) if x is None else x
-            known = loose.get(axis)
+            known = separate.get(axis)
             if isinstance(known, Numbers) and not np.array_equal(known.vector(axis), x):
                 axis = f"{axis} of {column.name}"
             unit = "s" if is_time else "Hz" if axis.startswith("frequency") else ""
-            loose[axis] = held(x, {"unit": unit} if unit else {})
-            loose[column.name] = held(column.values, {"unit": column.unit} if column.unit else {})
-        for shared in shared_axes({columns[n].name: axis for n, axis in waves.items()}):
+            separate[axis] = in_memory(x, {"unit": unit} if unit else {})
+            separate[column.name] = in_memory(
+                column.values, {"unit": column.unit} if column.unit else {}
+            )
+        for shared in shared_axes({columns[n].name: axis for n, axis in waveforms.items()}):
             recordings.append(_recording(name, columns, shared))
             notes += note_on_shift(shared)
-        loose |= words if loose else {}
-        contents = read_struct("", loose)
+        separate |= words if separate else {}
+        contents = read_struct("", separate)
         recordings += contents.recordings
         tables += [
-            table._replace(name=name if not place else f"{name}.{place}")
-            for place, table in contents.tables.items()
+            table._replace(name=name if not index else f"{name}.{index}")
+            for index, table in contents.tables.items()
         ]
         notes += contents.notes
     mark = next(word for word, each in SEPARATORS.items() if each == style.separator)
@@ -102,28 +104,28 @@ def read_labview_text(path: Path) -> LaboratoryFile:
 
 
 def _style(lines: Sequence[str], file: str) -> tuple[_Style, int]:
-    """What the file's header says, and the first line below it."""
+    """Format from the file header, and the index of the first line below it."""
     end = next((k for k, line in enumerate(lines) if line.startswith(_END)), None)
     if end is None:
         raise ValueError(f"{file} is damaged: its header has no end ({_END}).")
-    said: dict[str, str] = {}
+    entries: dict[str, str] = {}
     for line in lines[1:end]:
         separator = "\t" if "\t" in line else ","
         key, _, value = line.partition(separator)
-        said[key.strip()] = value.strip().strip('"')
-    stated = said.get("Separator", "Tab").lower()
+        entries[key.strip()] = value.strip().strip('"')
+    stated = entries.get("Separator", "Tab").lower()
     separator = SEPARATORS.get({"": "tab", ",": "comma", ";": "semicolon"}.get(stated, stated), "")
-    x_columns = said.get("X_Columns", "One").lower()
+    x_columns = entries.get("X_Columns", "One").lower()
     if not separator or x_columns not in ("no", "one", "multi"):
         raise ValueError(
-            f"{file} states the separator {said.get('Separator')!r} and X_Columns "
-            f"{said.get('X_Columns')!r}: Tab, Comma or Semicolon, and No, One or Multi are known."
+            f"{file} states the separator {entries.get('Separator')!r} and X_Columns "
+            f"{entries.get('X_Columns')!r}: Tab, Comma or Semicolon, and No, One or Multi exist."
         )
-    decimal = {".": "point", ",": "comma"}.get(said.get("Decimal_Separator", "."), "")
+    decimal = {".": "point", ",": "comma"}.get(entries.get("Decimal_Separator", "."), "")
     if not decimal or (separator, decimal) == (",", "comma"):
         raise ValueError(
             f"{file} states the separator {stated} and the decimal mark "
-            f"{said.get('Decimal_Separator')!r}, which cannot be told apart."
+            f"{entries.get('Decimal_Separator')!r}, which cannot be distinguished."
         )
     return _Style(file, separator, decimal, x_columns), end + 1
 
@@ -162,7 +164,7 @@ def _segments(
         else:
             header[fields[0]] = fields
     if not segments:
-        raise ValueError(f"{style.file} has no segment: its header alone is there.")
+        raise ValueError(f"{style.file} has no segment: it has only a header.")
     return segments
 
 
@@ -175,13 +177,13 @@ def _columns(
         return [], {}, [Fact("not_read", name="a segment without samples", why="empty")]
     is_multi = style.x_columns == "multi"
     last = len(names) - 1 if names[-1] == "Comment" else len(names)
-    places = range(1, last, 2 if is_multi else 1)
+    channel_columns = range(1, last, 2 if is_multi else 1)
     stated = header.get("Channels", ["", ""])
     count = int(style.number(stated[1], "number of channels")) if len(stated) > 1 else 0
-    if names[0] != _X or count != len(places):
+    if names[0] != _X or count != len(channel_columns):
         raise ValueError(
             f"{file} states {count} channels, but its row of names has "
-            f"{len(places)}: {', '.join(names)}."
+            f"{len(channel_columns)}: {', '.join(names)}."
         )
     longest = max(len(fields) for _, fields in rows)
     if longest > len(names) and not (longest == last + 1 and names[-1] != "Comment"):
@@ -189,38 +191,47 @@ def _columns(
         raise ValueError(
             f"line {row} of {file} has {longest} fields, but its row of names has {len(names)}."
         )
-    table = {place: _numbers(rows, place, style) for place in range(last)}
-    plain = _unique([names[place] for place in places])
+    table = {index: _numbers(rows, index, style) for index in range(last)}
+    plain = _unique([names[index] for index in channel_columns])
     columns: list[_Column] = []
     notes: list[Fact] = []
-    for name, place in zip(plain, places, strict=True):
+    for name, index in zip(plain, channel_columns, strict=True):
 
-        def said(key: str, place: int = place) -> str:
+        def header_field(key: str, index: int = index) -> str:
             fields = header.get(key, [])
-            return fields[place] if place < len(fields) else ""
+            return fields[index] if index < len(fields) else ""
 
-        there = np.isfinite(table[place])
-        if not there.any():
+        finite = np.isfinite(table[index])
+        if not finite.any():
             notes.append(Fact("not_read", name=f"channel {name}", why="empty"))
             continue
-        end = int(np.flatnonzero(there)[-1]) + 1
-        x_place = {"no": None, "one": 0, "multi": place - 1}[style.x_columns]
-        x = None if x_place is None else table[x_place][:end]
+        end = int(np.flatnonzero(finite)[-1]) + 1
+        x_index = {"no": None, "one": 0, "multi": index - 1}[style.x_columns]
+        x = None if x_index is None else table[x_index][:end]
         x = None if x is None or not np.isfinite(x).all() else x
-        n = int(style.number(said("Samples"), "number of samples")) if said("Samples") else None
+        n = (
+            int(style.number(header_field("Samples"), "number of samples"))
+            if header_field("Samples")
+            else None
+        )
         if n is not None and n > end:
             notes.append(Fact("samples_missing", name=name, n=end, of=n))
-        if not there[:end].all():
-            notes.append(Fact("empty_fields", name=name, n=int((~there[:end]).sum())))
-        start = style.number(said("X0"), "X0") if said("X0") else 0.0
-        step = style.number(said("Delta_X"), "Delta_X") if said("Delta_X") else 0.0
-        step = _exact_step(said("Delta_X"), step, notes) if step > 0 else step
+        if not finite[:end].all():
+            notes.append(Fact("empty_fields", name=name, n=int((~finite[:end]).sum())))
+        start = style.number(header_field("X0"), "X0") if header_field("X0") else 0.0
+        step = style.number(header_field("Delta_X"), "Delta_X") if header_field("Delta_X") else 0.0
+        step = _exact_step(header_field("Delta_X"), step, notes) if step > 0 else step
         if style.x_columns == "no" and step <= 0:
             raise ValueError(f"{file} states no step (Delta_X) of channel {name}, and no times.")
         columns.append(
             _Column(
-                *(name, said("Y_Unit_Label"), said("X_Dimension"), start + _clock(header, place)),
-                *(step, n, x, table[place][:end]),
+                *(
+                    name,
+                    header_field("Y_Unit_Label"),
+                    header_field("X_Dimension"),
+                    start + _clock(header, index),
+                ),
+                *(step, n, x, table[index][:end]),
             )
         )
     comments = [
@@ -230,11 +241,11 @@ def _columns(
     return columns, words, notes
 
 
-def _numbers(rows: Sequence[tuple[int, list[str]]], place: int, style: _Style) -> np.ndarray:
+def _numbers(rows: Sequence[tuple[int, list[str]]], index: int, style: _Style) -> np.ndarray:
     """A column of numbers; NaN where a field is empty."""
     values = np.full(len(rows), np.nan)
     for k, (line, fields) in enumerate(rows):
-        field = fields[place] if place < len(fields) else ""
+        field = fields[index] if index < len(fields) else ""
         if not field:
             continue
         value = number_in(field, style.decimal)
@@ -247,8 +258,8 @@ def _numbers(rows: Sequence[tuple[int, list[str]]], place: int, style: _Style) -
     return values
 
 
-def _clock(header: dict[str, list[str]], place: int) -> float:
-    """Seconds by which a channel starts after the earliest of its segment, by its time of day."""
+def _clock(header: dict[str, list[str]], index: int) -> float:
+    """Start of a channel in s after the earliest of its segment, from the time of day."""
     times: dict[int, float] = {}
     for k, word in enumerate(header.get("Time", [])[1:], 1):
         parts = [number_in(part, "comma" if "," in part else "point") for part in word.split(":")]
@@ -258,22 +269,22 @@ def _clock(header: dict[str, list[str]], place: int) -> float:
             day = np.datetime64(days[k].replace("/", "-")) if k < len(days) and days[k] else None
             since = 0.0 if day is None else float(day.astype("datetime64[D]").astype(int)) * 86400
             times[k] = since + known[0] * 3600 + known[1] * 60 + known[2]
-    return times[place] - min(times.values()) if place in times else 0.0
+    return times[index] - min(times.values()) if index in times else 0.0
 
 
 def _is_even(column: _Column) -> bool:
-    """Whether samples lie as `start` and `step` say: no times beside them say otherwise."""
+    """Whether samples are even by `start` and `step`, and stated times agree."""
     if column.step <= 0 or not np.isfinite(column.values).all() or len(column.values) < 2:
         return False
     if column.abscissa is None:
         return True
     steps = np.diff(column.abscissa)
-    # Printed times have six decimals: their rounding is no unevenness.
+    # Printed times have six decimals: tolerate their rounding.
     return bool(np.all(np.abs(steps - column.step) < _EVEN * column.step + 1.01e-6))
 
 
 def _recording(name: str, columns: Sequence[_Column], shared: SharedAxis) -> TimeRecording:
-    """Channels of one clock as a record."""
+    """Channels on a common clock as a record."""
     by_name = {column.name: column for column in columns}
     rows, channels = [], []
     for key, skip in zip(shared.channels, shared.skipped, strict=True):
@@ -285,15 +296,15 @@ def _recording(name: str, columns: Sequence[_Column], shared: SharedAxis) -> Tim
     whole = round(rate)
     rate = float(whole) if whole and abs(rate / whole - 1) < 1e-12 else rate
     return time_recording(
-        HeldSamples(np.stack(rows)), channels, rate, start_time=shared.axis.start, name=name
+        SamplesInMemory(np.stack(rows)), channels, rate, start_time=shared.axis.start, name=name
     )
 
 
 def _exact_step(word: str, step: float, notes: list[Fact]) -> float:
-    """A sampling interval that was printed with few digits: of the only whole rate it can mean.
+    """The exact sampling interval of one printed with few digits, by the unique whole rate.
 
-    "0.000977" is 1024 Hz: no other whole rate is printed so. Where there are several, the interval
-    is taken as it stands, and a note says what its digits leave open.
+    "0.000977" is 1024 Hz, the only whole rate with that rounding. If there are several, the
+    interval is used as printed, and a note states the uncertainty.
     """
     plain, _, power = word.lower().replace(",", ".").partition("e")
     half = 0.5 * 10.0 ** (int(power or 0) - len(plain.partition(".")[2]))
@@ -308,7 +319,7 @@ def _exact_step(word: str, step: float, notes: list[Fact]) -> float:
 
 
 def _unique(names: Sequence[str]) -> list[str]:
-    """Names of which none occurs twice."""
+    """Names made unique."""
     plain: list[str] = []
     for k, name in enumerate(names, 1):
         word = name or f"channel {k}"

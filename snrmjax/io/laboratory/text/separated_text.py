@@ -1,4 +1,4 @@
-"""Separated text (CSV and its relatives): separator, decimal mark and header found or told."""
+"""Separated text (CSV and similar): separator, decimal mark and header detected or stated."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 
 from snrmjax.io.files import shown
 from snrmjax.io.laboratory.arrays.structs import read_struct
-from snrmjax.io.laboratory.arrays.value_tree import Node, held
+from snrmjax.io.laboratory.arrays.value_tree import Node, in_memory
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.names import Label, label_of, role_of
 from snrmjax.io.laboratory.physical_units import level_reference, unit_meaning
@@ -24,7 +24,7 @@ from snrmjax.io.laboratory.text.fields import (
 )
 from snrmjax.numerics.facts import Fact
 
-_LOOKED_AT = 200  # lines in which the header ends
+_INSPECTED_LINES = 200  # lines searched for the first row of numbers
 _MOST_COLUMNS = 4096
 _COMMENTS = ("#", "%", "//", "!")
 _AXES = ("time", "frequency", "level", "rate", "step")
@@ -60,13 +60,13 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
             continue
         if missing:
             notes.append(Fact("empty_fields", name=name, n=missing))
-        tree[name] = held(column, {"unit": units[name]} if units.get(name) else {})
-    said = _said_above(lines[:first], separator, decimal)
+        tree[name] = in_memory(column, {"unit": units[name]} if units.get(name) else {})
+    metadata = _metadata_above(lines[:first], separator, decimal)
     axes = {role_of(name) for name in tree}
-    if said.rate and not axes & {"time", "frequency", "rate", "step"}:
-        tree["fs" if said.is_rate else "dt"] = held(np.asarray(said.rate))
-        notes.append(Fact("rate_stated_above", text=said.text))
-    signal, described = said.signal, [name for name in tree if role_of(name) not in _AXES]
+    if metadata.rate and not axes & {"time", "frequency", "rate", "step"}:
+        tree["fs" if metadata.is_rate else "dt"] = in_memory(np.asarray(metadata.rate))
+        notes.append(Fact("rate_stated_above", text=metadata.text))
+    signal, described = metadata.signal, [name for name in tree if role_of(name) not in _AXES]
     if signal and len(described) == 1 and signal not in tree:
         tree = {signal if name == described[0] else name: node for name, node in tree.items()}
     mark = next(word for word, each in SEPARATORS.items() if each == separator)
@@ -77,8 +77,8 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     return LaboratoryFile(file, "csv", records, (), tables, (*notes, *contents.notes))
 
 
-class _Said(NamedTuple):
-    """What lines above a table say of it."""
+class _TableMetadata(NamedTuple):
+    """Metadata from lines above a table."""
 
     signal: str = ""
     rate: float = 0.0  # Hz, or a step in s
@@ -86,12 +86,12 @@ class _Said(NamedTuple):
     text: str = ""
 
 
-def _said_above(lines: Sequence[str], separator: str, decimal: str) -> _Said:
-    """The name of the only signal, and the sampling rate or step, that a key and a value state.
+def _metadata_above(lines: Sequence[str], separator: str, decimal: str) -> _TableMetadata:
+    """Name of a single signal, and sampling rate or step, from lines with key and value.
 
     "Sampling rate:<tab>5120 Hz", "dt = 0,001 s", "Signal:<tab>Vib - Velocity - Samples".
     """
-    said = _Said()
+    metadata = _TableMetadata()
     for line in lines:
         plain = line.strip().lstrip("#%!/ ").strip()
         fields = [field for field in fields_of(plain, separator) if field]
@@ -100,52 +100,53 @@ def _said_above(lines: Sequence[str], separator: str, decimal: str) -> _Said:
             fields = [key.strip(), value.strip()]
         key, value = fields[0].rstrip(":= "), " ".join(fields[1:])
         if key.lower() == "signal" and value:
-            parts = value.split(" - ")  # domain, channel, what of it
-            said = said._replace(signal=parts[1] if len(parts) == 3 else value)
+            parts = value.split(" - ")  # domain, channel, content
+            metadata = metadata._replace(signal=parts[1] if len(parts) == 3 else value)
         role = role_of(key)
-        if role not in ("rate", "step") or said.rate:
+        if role not in ("rate", "step") or metadata.rate:
             continue
         number, _, unit = value.partition(" ")
-        size = number_in(number, decimal, thousands=True)
-        size = number_in(number, "point") if size is None else size
+        quantity = number_in(number, decimal, thousands=True)
+        quantity = number_in(number, "point") if quantity is None else quantity
         unit = unit.strip() or label_of(key).unit or ("Hz" if role == "rate" else "s")
         try:
             meaning = unit_meaning(unit)
         except ValueError:
             continue
-        if size is None or size <= 0 or meaning.dimension not in ("frequency", "time"):
+        if quantity is None or quantity <= 0 or meaning.dimension not in ("frequency", "time"):
             continue
         is_rate = meaning.dimension == "frequency"
         factor = meaning.factor / (2 * np.pi) if is_rate else meaning.factor
-        said = said._replace(rate=size * factor, is_rate=is_rate, text=plain)
-    return said
+        metadata = metadata._replace(rate=quantity * factor, is_rate=is_rate, text=plain)
+    return metadata
 
 
 def _marks(lines: list[str], stated: TextFormat, file: str) -> tuple[str, str]:
-    """Separator and decimal mark: those with which most lines are rows of numbers."""
+    """Separator and decimal mark that give most numbers."""
     separators = [SEPARATORS[stated.separator]] if stated.separator else SEPARATORS.values()
     decimals = [stated.decimal] if stated.decimal else ["point", "comma"]
-    looked = [line for line in lines[:_LOOKED_AT] if line.strip()]
-    is_quoted = any('"' in line for line in looked)
+    inspected = [line for line in lines[:_INSPECTED_LINES] if line.strip()]
+    is_quoted = any('"' in line for line in inspected)
     scores = {
         (separator, decimal): score
         for separator in separators
         for decimal in decimals
         if ((separator, decimal) != (",", "comma") or is_quoted)
-        and (score := _score(looked, separator, decimal)) is not None
+        and (score := _score(inspected, separator, decimal)) is not None
     }
     if not scores:
-        begins = f": it begins with {shown(looked[0].strip())}" if looked else ""
-        raise ValueError(f"{file} has no row of numbers in its first {_LOOKED_AT} lines{begins}.")
+        begins = f": it begins with {shown(inspected[0].strip())}" if inspected else ""
+        raise ValueError(
+            f"{file} has no row of numbers in its first {_INSPECTED_LINES} lines{begins}."
+        )
     return max(scores, key=lambda marks: scores[marks])
 
 
 def _score(lines: list[str], separator: str, decimal: str) -> tuple[int, int] | None:
-    """How many numbers these marks give in rows of the widest kind, or None: no row at all.
+    """Score of a separator and decimal mark: the numbers in the widest rows; None without a row.
 
-    A field that is no number counts against them twice: "79,5" cut at its comma gives numbers too.
-    Of two that give as many the one with fewer separators of thousands is better, and blanks
-    separate no columns where tabs do.
+    A field that is no number subtracts two, since "79,5" split at its comma gives numbers too. Ties
+    go to fewer thousands separators, and blanks do not separate columns where tabs do.
     """
     split = [fields_of(line, separator) for line in lines]
     rows = [fields for fields in split if _is_row(fields, decimal)]
@@ -161,7 +162,7 @@ def _score(lines: list[str], separator: str, decimal: str) -> tuple[int, int] | 
 
 
 def _has_blank_thousands(line: str) -> bool:
-    """Whether tabs separate columns, and blanks stand between thousands: "1 000<tab>0,5"."""
+    """Whether tabs separate columns, and blanks separate thousands: "1 000<tab>0,5"."""
     fields = [field for field in fields_of(line, "\t") if field]
     is_blank = len(fields) > 1 and any(" " in field for field in fields)
     return is_blank and any(
@@ -174,7 +175,7 @@ def _count_numbers(fields: list[str], decimal: str) -> int:
 
 
 def _is_row(fields: list[str], decimal: str) -> bool:
-    """Whether fields are a row of a table: numbers, with a text or an empty one here and there."""
+    """Whether fields are a table row: at least half of them numbers."""
     good = _count_numbers(fields, decimal)
     return good > 0 and 2 * good >= len(fields)
 
@@ -182,38 +183,40 @@ def _is_row(fields: list[str], decimal: str) -> bool:
 def _first_row(
     lines: list[str], separator: str, decimal: str, stated: TextFormat, file: str
 ) -> tuple[int, int]:
-    """The first row of numbers (from zero) and its number of columns, which all rows below have."""
+    """Index of the first row of numbers and the number of columns of the table."""
     start = stated.header_row or 0
-    split = ((k, fields_of(lines[k], separator)) for k in range(start, len(lines))[:_LOOKED_AT])
+    split = (
+        (k, fields_of(lines[k], separator)) for k in range(start, len(lines))[:_INSPECTED_LINES]
+    )
     widths = {k: len(fields) for k, fields in split if _is_row(fields, decimal)}
     if not widths:
         raise ValueError(f"{file} has no row of numbers below row {start}.")
     width = max(widths.values())
     if width > _MOST_COLUMNS:
         raise ValueError(f"{file} has {width} columns, more than {_MOST_COLUMNS}.")
-    # A row may lack its last values: what lies between the first and the widest are rows too.
+    # The first rows may lack their last values: the widest row sets the number of columns.
     first = next(k for k in widths if widths[k] == width)
     return first, width
 
 
 class _Header(NamedTuple):
-    """What stands above the columns: names (each its own), as they are written, units, labels."""
+    """Header of the columns: unique names, names as written, units, labels of runs."""
 
     names: tuple[str, ...]
     written: tuple[str, ...]
     units: Mapping[str, str]
-    labels: tuple[str, ...]  # of runs, above or below the names; or none
+    labels: tuple[str, ...]  # of runs, above or below the names; may be empty
     is_found: bool
 
 
 def _header(
     lines: list[str], first: int, width: int, separator: str, stated: TextFormat, file: str
 ) -> _Header:
-    """Names and units of the rows above the numbers: of the row with most fields that fits."""
+    """Names and units from the rows above the numbers, by the fullest row that fits."""
     at = (stated.header_row or 0) - 1
     rows = {
         k: (fields + [""] * width)[:width]
-        for k in range(max(0, first - _LOOKED_AT), first)
+        for k in range(max(0, first - _INSPECTED_LINES), first)
         if 0 < len(fields := fields_of(lines[k].lstrip("#%!/ "), separator)) <= width or k == at
     }
     if at >= 0:
@@ -224,7 +227,7 @@ def _header(
                 f"have {width} columns."
             )
         if not re.search(r"[^\W\d]", "".join(rows[at]).lower().replace("e", "")):
-            raise ValueError(f"--header-row {at + 1} of {file} holds numbers, not names.")
+            raise ValueError(f"--header-row {at + 1} of {file} has numbers, not names.")
         names, below = rows[at], [rows[k] for k in rows if k > at]
     else:
         filled = {k: sum(bool(field) for field in row) for k, row in rows.items()}
@@ -238,7 +241,7 @@ def _header(
             last = above[-1]
         names, below = rows[last], [rows[k] for k in rows if k > last]
     unit_row = next((row for row in below if _all_units(row)), [""] * width)
-    # Labels stand where a group of columns begins: "002: [01-05-26 09:28]" above its first.
+    # Labels are above the first column of a group: "002: [01-05-26 09:28]".
     marked = (row for row in (*below, *rows.values()) if row not in (names, unit_row))
     labels = next((row for row in marked if 1 < sum(map(bool, row)) < width and not row[0]), [])
     units: dict[str, str] = {}
@@ -246,7 +249,7 @@ def _header(
     labels_of = [label if (label := label_of(name)).is_bracketed else Label(name) for name in names]
     short = [label.word for label in dict.fromkeys(labels_of)]
     for k, (name, label) in enumerate(zip(names, labels_of, strict=True)):
-        # Names that differ in their units alone stay as they are written.
+        # Names that differ only by their units are kept as written.
         is_short = label.word and short.count(label.word) == 1
         word, unit = (label.word, label.unit) if is_short else (name, "")
         word = word or f"column_{k + 1}"
@@ -261,30 +264,30 @@ def _header(
 def _runs_side_by_side(
     header: _Header, columns: Mapping[str, np.ndarray | list[str]]
 ) -> tuple[dict[str, np.ndarray | list[str]], Mapping[str, str], tuple[str, ...]] | None:
-    """Runs that lie side by side as one table with the number of the run, or None: there are none.
+    """Stack runs in adjacent column groups into one table with the run number; None without runs.
 
-    They do where the same names come again: "f, v, phase, v, phase" with one frequency for all, or
-    "f, v, phase, f, v, phase" with one for each. Two columns of one name alone are two channels,
-    unless labels stand above them.
+    Runs are recognised by repeated names: "f, v, phase, v, phase" with a common frequency, or
+    "f, v, phase, f, v, phase" with one for each. A single repeated name is a second channel unless
+    labels are above it.
     """
     names, written, labels = header.names, header.written, header.labels
     if not header.is_found or any(isinstance(column, list) for column in columns.values()):
         return None
-    # Columns of a frequency and of a control channel may be those of all runs.
+    # Leading columns (frequency, control channel) may be common to all runs.
     for shared in range(len(names) - 1):
         groups = _repeated(written[shared:], 1 if labels and shared else 2)
         if groups > 1:
             break
     else:
         return None
-    size = (len(names) - shared) // groups
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in names[: shared + size]}
+    width = (len(names) - shared) // groups
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in names[: shared + width]}
     number: list[np.ndarray] = []
     for group in range(groups):
-        at = shared + group * size
-        own = [np.asarray(columns[name]) for name in names[at : at + size]]
-        there = np.isfinite(np.stack(own)).any(axis=0)
-        for name, column in zip(names[shared : shared + size], own, strict=True):
+        at = shared + group * width
+        group_columns = [np.asarray(columns[name]) for name in names[at : at + width]]
+        there = np.isfinite(np.stack(group_columns)).any(axis=0)
+        for name, column in zip(names[shared : shared + width], group_columns, strict=True):
             parts[name].append(column[there])
         for name in names[:shared]:
             parts[name].append(np.asarray(columns[name])[there])
@@ -293,25 +296,25 @@ def _runs_side_by_side(
     stacked: dict[str, np.ndarray | list[str]] = {
         name: np.concatenate(each) for name, each in parts.items()
     }
-    said = [
-        next((word for word in labels[at : at + size] if word), "")
-        for at in range(shared, len(names), size)
+    run_labels = [
+        next((word for word in labels[at : at + width] if word), "")
+        for at in range(shared, len(names), width)
     ] * bool(labels)
-    words = {"run label": [said[int(k) - 1] for k in run]} if any(said) else {}
+    words = {"run label": [run_labels[int(k) - 1] for k in run]} if any(run_labels) else {}
     units = {name: unit for name, unit in header.units.items() if name in stacked}
-    return {"run": run} | stacked | words, units, tuple(said)
+    return {"run": run} | stacked | words, units, tuple(run_labels)
 
 
 def _repeated(names: Sequence[str], fewest: int) -> int:
-    """How many times one group of names, of `fewest` at least, makes up all of them."""
-    for size in range(fewest, len(names) // 2 + 1):
-        if len(names) % size == 0 and list(names) == list(names[:size]) * (len(names) // size):
-            return len(names) // size
+    """Number of repetitions of a group of at least `fewest` names that gives all names."""
+    for width in range(fewest, len(names) // 2 + 1):
+        if len(names) % width == 0 and list(names) == list(names[:width]) * (len(names) // width):
+            return len(names) // width
     return 1
 
 
 def _all_units(fields: list[str]) -> bool:
-    """Whether a row is one of units: each is understood or empty, and one at least has letters."""
+    """Whether all fields of a row are units or empty, with letters in at least one."""
     for field in fields:
         if level_reference(field.strip("()")) is not None:
             continue

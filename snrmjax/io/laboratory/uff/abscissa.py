@@ -1,4 +1,4 @@
-"""Abscissae of a universal file: six digits of step and start, and what they can mean."""
+"""Abscissae of a universal file, from step and start with six digits."""
 
 import math
 from collections.abc import Mapping
@@ -9,12 +9,12 @@ from jaxtyping import Float
 
 from snrmjax.numerics.facts import Fact
 
-_EVEN = 1e-6  # of a step: an abscissa of doubles that is uneven by less is even
-_DIGITS = 5  # behind the first, in the header's E13.5
+_EVEN = 1e-6  # of a step: tolerance of an even abscissa in double precision
+_DIGITS = 5  # after the first, in the header's E13.5
 
 
 class EvenAbscissa(NamedTuple):
-    """An abscissa at even steps: `first + k / rate`."""
+    """An evenly spaced abscissa: `first + k / rate`."""
 
     first: float
     rate: float
@@ -24,8 +24,8 @@ class EvenAbscissa(NamedTuple):
 def even_abscissa(function: Mapping[str, Any]) -> EvenAbscissa | None:
     """Start and rate of a function's abscissa, or None where its steps are uneven.
 
-    The header has both to six digits. Where these digits allow one whole number of samples per
-    unit (4.88281E-04 s: 2048 Hz), that is taken.
+    The header has both to six digits. If these fit exactly one whole number of samples per unit
+    (4.88281E-04 s: 2048 Hz), that is used.
     """
     x = np.asarray(function["x"])
     if function["abscissa_spacing"] != 1:

@@ -18,7 +18,7 @@ _QUANTITIES: dict[int, Quantity] = {
 
 
 class UnitSystem(NamedTuple):
-    """Data set 164: a number of the file over its factor is in SI."""
+    """Data set 164: numbers in the file divided by these factors are in SI."""
 
     length: float = 1.0
     force: float = 1.0
@@ -26,7 +26,7 @@ class UnitSystem(NamedTuple):
 
 
 class AxisUnit(NamedTuple):
-    """What an axis is in: a number of it times `calibration` is in the SI unit of `quantity`."""
+    """Unit of an axis: a number times `calibration` is in the SI unit of `quantity`."""
 
     quantity: Quantity
     unit: str
@@ -51,8 +51,8 @@ def unit_system(sets: Sequence[Mapping[str, Any]]) -> UnitSystem:
 def axis_unit(function: Mapping[str, Any], axis: str, units: UnitSystem) -> AxisUnit:
     """The unit of an axis ("ordinate", "orddenom"): its label, else the file's system of units.
 
-    A label such as (mm/s)/lbf of an ordinate is that of response over reference: the reference is
-    then a force, in newtons where its own axis states nothing else.
+    An ordinate label such as (mm/s)/lbf is that of response per reference: the reference is then a
+    force, in newtons unless its own axis states another unit.
     """
     quantity = _QUANTITIES.get(function.get(f"{axis}_spec_data_type", 0), "unknown")
     label = stated(function.get(f"{axis}_axis_units_lab", ""))
@@ -76,8 +76,12 @@ def axis_unit(function: Mapping[str, Any], axis: str, units: UnitSystem) -> Axis
         return AxisUnit(quantity, label, 1.0, (Fact("unit_unknown", unit=label),))
     if meaning.quantity == "unknown" or meaning.per_volt:
         return AxisUnit(quantity, label, meaning.factor if meaning.dimension == "other" else 1.0)
-    # What the reference's own axis states divides once more, so that it is put in here.
-    below = axis_unit(function, "orddenom", units).calibration if meaning.per_force else 1.0
+    # The reference axis' factor divides again later, so multiply by it here.
+    reference_factor = (
+        axis_unit(function, "orddenom", units).calibration if meaning.per_force else 1.0
+    )
     other = quantity not in ("unknown", meaning.quantity)
     notes = (Fact("unit_of_other_quantity", stated=quantity, unit=label, taken=meaning.quantity),)
-    return AxisUnit(meaning.quantity, label, meaning.factor * below, notes if other else ())
+    return AxisUnit(
+        meaning.quantity, label, meaning.factor * reference_factor, notes if other else ()
+    )

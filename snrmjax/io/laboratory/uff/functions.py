@@ -1,4 +1,4 @@
-"""Universal files: functions (data sets 58) gathered to records, responses and tables."""
+"""Universal files: functions (data sets 58) combined into records, responses and tables."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ _Function = Mapping[str, Any]
 
 
 class _Source(NamedTuple):
-    """What holds for all functions of a file, and the notes on them."""
+    """File name and units common to all functions, and notes."""
 
     file: str
     units: UnitSystem
@@ -34,13 +34,13 @@ class _Source(NamedTuple):
         self.notes.extend(unit.notes)
         node = function.get(f"{side}_node", 0)
         return Channel(
-            *(_place(function, side), unit.quantity, unit.unit, unit.calibration),
+            *(_point_name(function, side), unit.quantity, unit.unit, unit.calibration),
             *(str(node) if node else "", direction_of(function.get(f"{side}_dir", 0))),
         )
 
 
 def read_uff(path: Path) -> LaboratoryFile:
-    """A universal file: its functions that belong together, as what they are.
+    """A universal file, its functions grouped into records, responses and tables.
 
     Raises `ValueError` as `read_laboratory_file` does.
     """
@@ -83,7 +83,7 @@ def read_uff(path: Path) -> LaboratoryFile:
 
 
 def _grouped(sets: Sequence[_Function], *kinds: int) -> list[list[_Function]]:
-    """Functions of some kinds, those with the same abscissa and z value together."""
+    """Functions of some kinds, grouped by equal abscissa and z value."""
     groups: list[list[_Function]] = []
     for function in (each for each in sets if each["func_type"] in kinds):
         for group in groups:
@@ -96,8 +96,8 @@ def _grouped(sets: Sequence[_Function], *kinds: int) -> list[list[_Function]]:
     return groups
 
 
-def _place(function: _Function, side: str) -> str:
-    """Where a function was measured, in words; of a record without a place, what its axis says."""
+def _point_name(function: _Function, side: str) -> str:
+    """Name of the measurement point of a function; of a record without one, its axis label."""
     entity = stated(function.get(f"{side}_ent_name", ""))
     node = function.get(f"{side}_node", 0)
     point = f"{node}{direction_of(function.get(f'{side}_dir', 0))}"
@@ -108,7 +108,7 @@ def _place(function: _Function, side: str) -> str:
 
 
 def _unique(channels: Sequence[Channel]) -> list[Channel]:
-    """Channels with names of their own: doubled ones get the quantity, then a number."""
+    """Channels with unique names: duplicates get the quantity, then a number."""
     named = list(channels)
     for ending in ("{channel.quantity}", "#{number}"):
         names = [channel.name for channel in named]
@@ -122,16 +122,16 @@ def _unique(channels: Sequence[Channel]) -> list[Channel]:
 
 
 def _recording(group: Sequence[_Function], source: _Source) -> TimeRecording | None:
-    """Time records of one time axis, or None where it is uneven."""
+    """A time record of functions on one time axis; None where it is uneven."""
     even = even_abscissa(group[0])
     if even is None:
         source.notes.append(Fact("uneven_record"))
         return None
     channels = _unique([source.channel(function, "rsp", "ordinate") for function in group])
     if any(np.iscomplexobj(function["data"]) for function in group):
-        raise ValueError("a time record of complex numbers is no time record.")
+        raise ValueError("a time record cannot have complex numbers.")
     described = [stated(function["id1"]) for function in group]
-    said = [
+    descriptions = [
         Fact("channel_described", name=channel.name, text=text)
         for channel, text in zip(channels, described, strict=True)
         if text
@@ -142,27 +142,27 @@ def _recording(group: Sequence[_Function], source: _Source) -> TimeRecording | N
         even.rate,
         start_time=even.first,
         name=described[0] if len(set(described)) == 1 else "",
-        notes=[*even.notes, *said][:_MOST_NOTES],
+        notes=[*even.notes, *descriptions][:_MOST_NOTES],
     )
 
 
 def _without_doubles(group: Sequence[_Function]) -> list[list[_Function]]:
-    """Runs of functions in which no pair of response and reference stands twice."""
+    """Split functions so that no pair of response and reference is repeated."""
     parts: list[list[_Function]] = [[]]
-    seen: set[tuple] = set()
+    pairs: set[tuple] = set()
     for function in group:
         key = (
             *(
                 function["func_type"] == _COHERENCE,
-                _place(function, "rsp"),
-                _place(function, "ref"),
+                _point_name(function, "rsp"),
+                _point_name(function, "ref"),
             ),
             function.get("ordinate_spec_data_type"),
         )
-        if key in seen:
+        if key in pairs:
             parts.append([])
-            seen = set()
-        seen.add(key)
+            pairs = set()
+        pairs.add(key)
         parts[-1].append(function)
     return parts
 
@@ -177,15 +177,15 @@ def _responses(part: Sequence[_Function], x: np.ndarray, source: _Source) -> Fre
     values = np.full((len(rows), len(columns), x.size), np.nan, dtype=complex)
     coherence = np.full(values.shape, np.nan)
     coherent = {
-        (_place(function, "rsp"), _place(function, "ref")): function["data"].real
+        (_point_name(function, "rsp"), _point_name(function, "ref")): function["data"].real
         for function in part
         if function["func_type"] == _COHERENCE
     }
     for function, output, given in zip(measured, outputs, inputs, strict=True):
-        at = rows[output], columns[given]
-        values[at] = function["data"]
-        coherence[at] = coherent.get(
-            (_place(function, "rsp"), _place(function, "ref")), coherence[at]
+        index = rows[output], columns[given]
+        values[index] = function["data"]
+        coherence[index] = coherent.get(
+            (_point_name(function, "rsp"), _point_name(function, "ref")), coherence[index]
         )
     even = even_abscissa(measured[0])
     return frequency_responses(
@@ -202,14 +202,18 @@ def _responses(part: Sequence[_Function], x: np.ndarray, source: _Source) -> Fre
 def _column(function: _Function, name: str) -> str:
     """The name of a function in a table."""
     if function["func_type"] == _COHERENCE:
-        return f"coherence of {name} over {_place(function, 'ref')}"
-    return f"{name} over {_place(function, 'ref')}" if function["func_type"] in _RESPONSE else name
+        return f"coherence of {name} over {_point_name(function, 'ref')}"
+    return (
+        f"{name} over {_point_name(function, 'ref')}"
+        if function["func_type"] in _RESPONSE
+        else name
+    )
 
 
 def _table(
     group: Sequence[_Function], name: str, source: _Source, first: str = "frequency"
 ) -> NumberTable:
-    """Functions of one abscissa as columns beside it."""
+    """Functions of one abscissa as columns of a table."""
     kind = "time" if group[0].get("abscissa_spec_data_type") == 17 else first
     channels = [source.channel(function, "rsp", "ordinate") for function in group]
     named = _unique(

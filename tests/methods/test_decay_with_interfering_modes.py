@@ -1,4 +1,4 @@
-"""Methods of decays where other modes ring beside the model's: right, or refused with a reason."""
+"""Decay methods with interfering modes: right, or refused with a reason."""
 
 import json
 import sys
@@ -17,10 +17,10 @@ MODES = sj.model.linear_modes([HZ * HERTZ], [RATIO], [[1.0]], [1.0], sensors=("t
 METHODS = ("resonant_decay", "ssm", "restoring_force")
 
 
-def ringing(hertz, ratio, size):
+def ringing(hertz, ratio, amplitude):
     """A linear mode's decay: all of its numbers are known."""
     omega = HERTZ * hertz
-    return size * np.exp(-ratio * omega * TIME) * np.cos(omega * np.sqrt(1 - ratio**2) * TIME)
+    return amplitude * np.exp(-ratio * omega * TIME) * np.cos(omega * np.sqrt(1 - ratio**2) * TIME)
 
 
 def record(*others):
@@ -51,7 +51,7 @@ def test_all_methods_follow_the_mode(compared):
             assert np.mean(np.abs(found - true) < 1.96 * std) > 0.8
 
 
-def test_the_company_is_told(compared):
+def test_interfering_modes_are_reported(compared):
     kinds = [note["note"].kind for note in compared.decays]
     assert kinds[:3] == ["mode_isolated", "interfering_modes_of_decay", "bias_of_mode_filter"]
     (interfering,) = [
@@ -77,18 +77,18 @@ def run(tmp_path, monkeypatch, capsys, data):
     return ended.value.code or 0, " ".join(capsys.readouterr().err.split())
 
 
-def test_the_command_says_what_lies_beside_the_mode(tmp_path, monkeypatch, capsys):
-    code, said = run(tmp_path, monkeypatch, capsys, record(*FAR))
+def test_the_command_reports_interfering_modes(tmp_path, monkeypatch, capsys):
+    code, printed = run(tmp_path, monkeypatch, capsys, record(*FAR))
     assert code == 0
-    assert "of the decay's energy is other motion" in said
-    told = json.loads((tmp_path / "out" / "summary.json").read_text())["decays"]
-    assert any("near 140 Hz" in line or "near 139.9 Hz" in line for line in told)
+    assert "of the decay's energy is other motion" in printed
+    notes = json.loads((tmp_path / "out" / "summary.json").read_text())["decays"]
+    assert any("near 140 Hz" in line or "near 139.9 Hz" in line for line in notes)
 
 
 def test_a_close_mode_is_refused_in_one_sentence(tmp_path, monkeypatch, capsys):
-    code, said = run(tmp_path, monkeypatch, capsys, record((43.0, 0.004, 0.12)))
+    code, printed = run(tmp_path, monkeypatch, capsys, record((43.0, 0.004, 0.12)))
     assert code == 2
-    assert "the mode cannot be isolated: inside its band" in said
+    assert "the mode cannot be isolated: inside its band" in printed
     assert not (tmp_path / "out").exists()
 
 

@@ -1,4 +1,4 @@
-"""Where curves of events turn in their parameter: cusps, isolas that begin or merge."""
+"""Turning points of event curves in their parameter: cusps, births and mergers of isolas."""
 
 from typing import NamedTuple
 
@@ -13,25 +13,25 @@ from snrmjax.simulate.continuation.continuation import StepControl, TracedCurve
 from snrmjax.simulate.continuation.event_equations import EventEquations, EventKind, bordered
 from snrmjax.simulate.continuation.event_location import EventSearch
 
-_BLOCK = 4  # turns that one call locates
+_BLOCK = 4  # turning points located in one call
 
 
-class _Turn(NamedTuple):
-    """A turn in the parameter, and by what kinds of it differ."""
+class _TurningPoint(NamedTuple):
+    """A turning point in the parameter, and the quantities that classify it."""
 
     point: Array
     resolved: Array
     missed: Array
-    faster: Array  # slope of the frequency in arclength
-    crossing: Array  # share of ∂R/∂λ that the singular matrix does not reach
-    curvature: Array  # above zero where the responses near it are closed
+    faster: Array  # derivative of the frequency by arclength
+    crossing: Array  # fraction of ∂R/∂λ outside the range of the singular matrix
+    curvature: Array  # positive where the nearby responses are closed
 
 
-def with_turns(
+def with_turning_points(
     equations: EventEquations, curve: TracedCurve, steps: StepControl
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """The points with those inserted at which the parameter turns, their names, and how many more
-    turns were not located."""
+    """The points with turning points of the parameter inserted, their names, and the number of
+    turning points that were not located."""
     points, ahead = curve.points, curve.tangents
     events = np.array([""] * len(points), dtype=object)
     where = np.flatnonzero(np.signbit(ahead[1:, -1]) != np.signbit(ahead[:-1, -1]))
@@ -39,53 +39,53 @@ def with_turns(
         return points, events, 0
     rows = [padded(r, _BLOCK) for r in (points[where], ahead[where], points[where + 1])]
     wanted = np.arange(len(rows[0])) < len(where)
-    turn = taken(_turns(equations, *rows, wanted, steps), np.arange(len(where)))
-    good = np.flatnonzero(turn.resolved)
-    names = [_kind_of(equations.kind, *(float(part[k]) for part in turn[-3:])) for k in good]
-    place = where[good] + 1
+    located = taken(_turning_points(equations, *rows, wanted, steps), np.arange(len(where)))
+    good = np.flatnonzero(located.resolved)
+    names = [_kind_of(equations.kind, *(float(part[k]) for part in located[-3:])) for k in good]
+    index = where[good] + 1
     return (
-        np.insert(points, place, turn.point[good], axis=0),
-        np.insert(events, place, names),
-        int(np.sum(turn.missed)),
+        np.insert(points, index, located.point[good], axis=0),
+        np.insert(events, index, names),
+        int(np.sum(located.missed)),
     )
 
 
 def _kind_of(kind: EventKind, faster: float, crossing: float, curvature: float) -> str:
     if kind != "fold":
         return "turn"
-    # wᵀ∂R/∂λ dλ vanishes at the turn: at a cusp by dλ, at a response that begins by the other.
+    # wᵀ∂R/∂λ dλ vanishes there: at a cusp since dλ = 0, at an isola since wᵀ∂R/∂λ = 0.
     if abs(faster) < abs(crossing):
         return "cusp"
     return "isola_birth" if curvature > 0 else "isola_merging"
 
 
 @compiled
-def _turns(
+def _turning_points(
     equations: EventEquations,
     here: Array,
     tangent: Array,
     there: Array,
     wanted: Array,
     steps: StepControl,
-) -> _Turn:
-    def located(here: Array, tangent: Array, there: Array, wanted: Array) -> _Turn:
+) -> _TurningPoint:
+    def locate(here: Array, tangent: Array, there: Array, wanted: Array) -> _TurningPoint:
         search = EventSearch(
             equations.linearised, lambda _, along: along[-1], here, tangent, there, steps
         )
-        found = search.ended(wanted)
-        crossing, curvature = _unfolding(equations, found.last.point)
-        return _Turn(
-            *(found.last.point, found.resolved & wanted, found.missed & wanted),
-            *(found.last.tangent[equations.balance.size], crossing, curvature),
+        end = search.ended(wanted)
+        crossing, curvature = _unfolding(equations, end.last.point)
+        return _TurningPoint(
+            *(end.last.point, end.resolved & wanted, end.missed & wanted),
+            *(end.last.tangent[equations.balance.size], crossing, curvature),
         )
 
-    return mapped(located, here, tangent, there, wanted)
+    return mapped(locate, here, tangent, there, wanted)
 
 
 def _unfolding(equations: EventEquations, point: Array) -> tuple[Array, Array]:
-    """How near ∂R/∂λ is to the range of the singular matrix, and the quadratic form's determinant.
+    """Component of ∂R/∂λ along the left null vector, and determinant of the quadratic form.
 
-    With both null vectors n of [∂R/∂x ∂R/∂λ] responses near a simple bifurcation obey
+    With both null vectors n of [∂R/∂x ∂R/∂λ] the responses near a simple bifurcation obey
     Σ (wᵀ∂²R n_i n_j) s_i s_j + 2 wᵀ∂R/∂μ dμ = 0: ellipses, or branches that cross.
     Reference: Golubitsky & Schaeffer, Singularities and Groups in Bifurcation Theory I (1985),
     chapter I.3, doi:10.1007/978-1-4612-5034-0.

@@ -1,4 +1,4 @@
-"""Backbones of tests that hold resonances by a controller, in the virtual laboratory."""
+"""Backbones from controlled phase-resonance tests in the virtual laboratory."""
 
 from collections.abc import Callable, Sequence
 
@@ -10,10 +10,10 @@ from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, meth
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.virtual_test.laboratory import Laboratory
 from snrmjax.simulate.virtual_test.phase_loop import LoopGains, locked_motions
-from snrmjax.simulate.virtual_test.record_phasors import HeldMotion
+from snrmjax.simulate.virtual_test.record_phasors import ControlledMotion
 from snrmjax.simulate.virtual_test.target_feedback import FeedbackBench, FeedbackSettings
 
-_SAME_VELOCITY = 0.02  # relative difference: levels that say nothing of a slope
+_SAME_VELOCITY = 0.02  # least relative difference of velocities that determines a slope
 
 
 def phase_locked_loop(
@@ -25,22 +25,21 @@ def phase_locked_loop(
     record_cycles: int = 50,
     seed: int = 0,
 ) -> MethodResult:
-    """Track the backbone: the loop stays closed while the drive voltage steps up.
+    """Backbone by a phase-locked loop that stays closed while the drive voltage is stepped up.
 
-    Damping is from the balance of power, 2ζ̃ω̃ = |Φ_r Φᵀb| F / |v|.
+    Damping is from the power balance, 2ζ̃ω̃ = |Φ_r Φᵀb| F / |v|.
 
     Arguments: `voltages` in V, in the order of the test; the others as in `locked_motions`.
-    Returns a `MethodResult` with a point a voltage; 1σ from the noise of the samples, which the
-    loop carries into its frequency, or from the scatter between tenths of the record where that
-    says more, and from the noise of the velocity at which the point lies, along the slope between
-    the levels. Levels whose record is off phase resonance by more than 1°, or whose
-    frequency wandered by more than half of ζω (1σ), are `NOT_LOCKED`. `test_seconds` counts
-    everything.
+    Returns a `MethodResult` with a point per voltage. 1σ is from the sample noise, which the loop
+    feeds into its frequency, or from the scatter between tenths of the record where that is
+    larger, and from the noise of the point's velocity times the slope between the levels. Levels
+    whose record is off phase resonance by more than 1°, or whose frequency varies by more than
+    half of ζω (1σ), are `NOT_LOCKED`. `test_seconds` is the duration of the whole test.
     Raises `ValueError` for voltages or cycles that are not positive.
-    Validity: where the natural frequency changes much with little amplitude (a stop, a gap) the
-    loop must follow faster than the motion grows: gains above the standard ones, or small steps.
-    A loop that has not come to rest is off by some times what it still drifts, which 1σ does not
-    know: 0.005 % of the frequency after 300 cycles at a large step under v|v|, nothing after 900.
+    Validity: where the natural frequency changes strongly over a small amplitude range (a stop, a
+    gap) the loop must be faster than the growth of the motion: use higher gains or smaller steps.
+    A loop that has not settled has an error of some times its remaining drift, which is not in 1σ:
+    0.005 % of the frequency after 300 cycles at a large step with v|v| damping, none after 900.
     """
     motions, _, seconds = locked_motions(
         *(laboratory, [(float(voltage), 0.0) for voltage in positive("voltages", voltages)]),
@@ -51,7 +50,7 @@ def phase_locked_loop(
     )
     per_force = drive_point(laboratory.structure.modes)
 
-    def point(level: int, motion: HeldMotion) -> MethodPoint:
+    def point(level: int, motion: ControlledMotion) -> MethodPoint:
         damping = per_force * (motion.force / motion.velocity).real
         ratio = damping / (2 * motion.frequency)
         return MethodPoint(
@@ -69,27 +68,26 @@ def control_based_continuation(
     *,
     seed: int = 0,
 ) -> MethodResult:
-    """The backbone: at each target amplitude the frequency at which force and velocity agree.
+    """Backbone: at each target amplitude the frequency at which velocity and force are in phase.
 
-    The phase that is left between them is taken away by the balance of the mode,
+    The remaining phase error is corrected by the equation of motion of the mode,
     ω̃² − Ω² + 2iζ̃ω̃Ω = iΩ|Φ_r Φᵀb| F/v.
 
-    Arguments: `amplitudes` of the target in m/s, rising. Returns a `MethodResult` with a point an
-    amplitude; damping by the balance of power. Amplitudes whose phase was not brought within 0.5°,
-    whose feedback kept harmonics of its own beyond `settings.invasive`, or that were not steady
-    within 1 %, are `NOT_LOCKED`. 1σ are those of the noise and of the scatter within a record; a
-    second mode close by or harmonics of the force are not in them. `test_seconds` counts
-    everything.
+    Arguments: `amplitudes` of the target in m/s, rising. Returns a `MethodResult` with a point per
+    amplitude; damping by the power balance. Amplitudes whose phase error stayed above 0.5°, whose
+    feedback is invasive (its own harmonics exceed `settings.invasive`), or that were not steady
+    within 1 %, are `NOT_LOCKED`. 1σ covers the noise and the scatter within a record, but neither
+    a close second mode nor harmonics of the force. `test_seconds` is the duration of the test.
     Raises `ValueError` for numbers that are not positive.
     """
     bench = FeedbackBench(laboratory, settings, seed)
     motions, omega = [], laboratory.frequency
-    for size in positive("amplitudes", amplitudes):
-        motions.append(bench.resonance(omega, float(size)))
+    for amplitude in positive("amplitudes", amplitudes):
+        motions.append(bench.resonance(omega, float(amplitude)))
         omega = motions[-1].frequency if motions[-1].held else omega
     per_force = drive_point(laboratory.structure.modes)
 
-    def point(level: int, motion: HeldMotion) -> MethodPoint:
+    def point(level: int, motion: ControlledMotion) -> MethodPoint:
         balance = per_force * motion.force / motion.velocity  # 2ζ̃ω̃ + (ω̃² − Ω²)/(iΩ)
         natural = float(np.sqrt(motion.frequency**2 - motion.frequency * balance.imag))
         error = abs(balance) * motion.ratio_std
@@ -102,22 +100,22 @@ def control_based_continuation(
 
 
 def _points(
-    motions: Sequence[HeldMotion], point: Callable[[int, HeldMotion], MethodPoint]
+    motions: Sequence[ControlledMotion], point: Callable[[int, ControlledMotion], MethodPoint]
 ) -> list[MethodPoint]:
-    """Points of held motions, whose 1σ hold that their own velocity is not exact either."""
+    """Points of locked motions; their 1σ includes the error of the velocity along the curve."""
     points = [
         point(level, motion) if motion.held else MethodPoint(MethodStatus.NOT_LOCKED, level)
         for level, motion in enumerate(motions, 1)
     ]
-    held = [k for k, motion in enumerate(motions) if motion.held]
-    at = np.log([points[k].velocity for k in held])
+    locked = [k for k, motion in enumerate(motions) if motion.held]
+    at = np.log([points[k].velocity for k in locked])
     order = np.argsort(at)
-    if len(held) < 2 or not np.all(np.diff(at[order]) > _SAME_VELOCITY):
+    if len(locked) < 2 or not np.all(np.diff(at[order]) > _SAME_VELOCITY):
         return points
-    curves = np.array([(points[k].natural_frequency, points[k].damping_ratio) for k in held])
+    curves = np.array([(points[k].natural_frequency, points[k].damping_ratio) for k in locked])
     slopes = np.empty_like(curves)
     slopes[order] = np.gradient(curves[order], at[order], axis=0)
-    for k, slope in zip(held, slopes, strict=True):
+    for k, slope in zip(locked, slopes, strict=True):
         frequency, ratio = slope * motions[k].velocity_std
         point_of_level = points[k]
         points[k] = point_of_level._replace(

@@ -6,9 +6,9 @@ import pytest
 from truths.balanced_sets import OMEGA, PARTICIPATION, SHAPE, ZETA, linear_model
 
 import snrmjax as sj
-from snrmjax.diagnose.response_prediction import held_curves
+from snrmjax.diagnose.response_prediction import controlled_velocity_curves
 from snrmjax.io.units import HERTZ
-from snrmjax.report.figures.diagnosis import held_velocity_figure
+from snrmjax.report.figures.diagnosis import controlled_velocity_figure
 
 HELD = (0.02, 0.05)  # m/s
 
@@ -30,7 +30,7 @@ def data():
 
 
 def test_the_force_that_holds_a_velocity_is_that_of_the_mode(data):
-    curves = held_curves(linear_model(), data, 0)
+    curves = controlled_velocity_curves(linear_model(), data, 0)
     assert [one.level for one in curves] == [3, 4]
     for one, held in zip(curves, HELD, strict=True):
         assert one.velocity == pytest.approx(held, rel=1e-12)
@@ -39,13 +39,15 @@ def test_the_force_that_holds_a_velocity_is_that_of_the_mode(data):
 
 
 def test_a_recorded_force_is_the_acting_one_over_its_gain(data):
-    (whole, _), (half, _) = (held_curves(linear_model(), data, 0, gain) for gain in (1.0, 2.0))
+    (whole, _), (half, _) = (
+        controlled_velocity_curves(linear_model(), data, 0, gain) for gain in (1.0, 2.0)
+    )
     np.testing.assert_allclose(2 * half.force, whole.force, rtol=1e-12)
 
 
 def test_lines_pass_through_the_measured_forces(data):
-    curves = held_curves(linear_model(), data, 0)
-    figure = held_velocity_figure(curves, curves, data, "sensor 1")
+    curves = controlled_velocity_curves(linear_model(), data, 0)
+    figure = controlled_velocity_figure(curves, curves, data, "sensor 1")
     for axes in figure.axes[:2]:
         (dots,) = (line for line in axes.lines if line.get_marker() == "o")
         lines = [line for line in axes.lines if line is not dots]
