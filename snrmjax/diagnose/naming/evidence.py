@@ -15,7 +15,14 @@ from scipy.special import log_ndtr, logsumexp
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column, odds_of
-from snrmjax.diagnose.naming.rows import Cell, Problem, RowBlock, Sizes
+from snrmjax.diagnose.naming.rows import (
+    AS_CURVES_LEAVE,
+    Cell,
+    LevelSizes,
+    Problem,
+    RowBlock,
+    Sizes,
+)
 from snrmjax.model.library.measurement_chain import ForceHarmonics
 
 _ALIKE = 2 * (priors.BAND * priors.DESCRIBED) ** 2  # of a column, that errors of two laws may be
@@ -38,6 +45,7 @@ class LawSums(NamedTuple):
     """What counts of all columns for remainders of some sizes."""
 
     sizes: Sizes
+    levels: LevelSizes
     base: float  # ln p of the rows without any law, times the prior of the sizes
     b: Float[np.ndarray, " column"]
     gram: Float[np.ndarray, "column column"]
@@ -47,9 +55,15 @@ class LawSums(NamedTuple):
     prior: Float[np.ndarray, " column"]  # probability among single laws
 
     @classmethod
-    def of(cls, columns: list[Column], block: RowBlock, sizes: Sizes) -> "LawSums":
-        """By one Cholesky factor."""
-        root = block.triangle * np.sqrt(block.variances(sizes))
+    def of(
+        cls,
+        columns: list[Column],
+        block: RowBlock,
+        sizes: Sizes,
+        levels: tuple[LevelSizes, float] = (AS_CURVES_LEAVE, 0.0),
+    ) -> "LawSums":
+        """By one Cholesky factor; `levels` with ln of their prior."""
+        root = block.triangle * np.sqrt(block.variances(sizes, levels[0]))
         factor = cholesky(root @ root.T + np.eye(len(root)), lower=True)
         white = solve_triangular(factor, block.along, lower=True)
         gram = block.across + white.T @ white
@@ -58,7 +72,14 @@ class LawSums(NamedTuple):
         odds = {kind: odds_of(kind) for kind in dict.fromkeys(kinds)}
         every = sum(odds.values())
         return cls(
-            *(sizes, base + _log_prior(sizes), gram[:-1, -1], gram[:-1, :-1], np.array(kinds)),
+            *(
+                sizes,
+                levels[0],
+                base + _log_prior(sizes) + levels[1],
+                gram[:-1, -1],
+                gram[:-1, :-1],
+                np.array(kinds),
+            ),
             np.array([column.sign for column in columns]),
             np.array([np.nan if c.std is None else c.std for c in columns]),
             np.array([odds[c.kind] / every * c.fraction for c in columns]),
@@ -109,7 +130,9 @@ class LawSums(NamedTuple):
         prior = np.log(priors.SIZES[2]) + np.log(fewer) * np.count_nonzero(self.sizes[:2])
         value = np.concatenate(values) + self.base + prior
         keep = np.flatnonzero(value > least)
-        return [Cell(float(value[k]), (int(i[k]), int(j[k])), self.sizes) for k in keep]
+        return [
+            Cell(float(value[k]), (int(i[k]), int(j[k])), self.sizes, self.levels) for k in keep
+        ]
 
     def together(self, columns: tuple[int, ...]) -> Cell | None:
         """Several laws as one hypothesis; None where one of them is not seen beside the others."""
@@ -138,7 +161,9 @@ class LawSums(NamedTuple):
         further[own] = False
         seen = apart & (b**2 > priors.VISIBLE**2 * square)
         some = np.flatnonzero(further & seen & (value > least)).tolist()
-        return [Cell(float(value[k]), (*cell.columns, k), cell.sizes) for k in some]
+        return [
+            cell._replace(log_evidence=float(value[k]), columns=(*cell.columns, k)) for k in some
+        ]
 
     def gains(
         self,
@@ -221,7 +246,7 @@ def _log_half(sign: np.ndarray, standardised: np.ndarray) -> np.ndarray:
 
 def seen_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.ndarray, " column"]:
     """Of every column the strength that would raise the evidence of a hypothesis by some nats."""
-    normal = LawSums.of(problem.columns, problem.blocks[0], cell.sizes[:2])
+    normal = LawSums.of(problem.columns, problem.blocks[0], cell.sizes[:2], (cell.levels, 0.0))
     for block, size in zip(problem.blocks[1:], cell.sizes[2:], strict=True):
         normal = normal.with_rows_of(LawSums.of(problem.columns, block, (size,)))
     some, n_rows = list(cell.columns), sum(len(block.rows) for block in problem.blocks)

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from snrmjax.diagnose import priors
@@ -21,9 +22,22 @@ from snrmjax.diagnose.naming.evidence import (
     sizes_of_remainders,
 )
 from snrmjax.diagnose.naming.readings import Readings
-from snrmjax.diagnose.naming.rows import Cell, Problem, RowBlock, Sizes, problem_of
+from snrmjax.diagnose.naming.rows import (
+    AS_CURVES_LEAVE,
+    Cell,
+    LevelSizes,
+    Problem,
+    RowBlock,
+    Sizes,
+    problem_of,
+)
+from snrmjax.identify.test_model.priors import LEVELS
 
 _ROUNDS = 3  # of finer shapes
+_LAWS = 4  # sets of laws, beside which errors of levels are found again
+_UNSEEN = 1e6  # nats, where one of the laws is not seen beside the others
+_LEAST_OF_LEVELS = np.log(0.05)  # ln of how much smaller these may be
+_WORTH = 1.0  # nats, from which on they are worth another set of hypotheses
 _COARSE = 40.0  # nats that a coarse shape may lack
 _REACH = 16.0  # nats below the best, down to which a column is kept while shapes are refined
 _COUNTS = 0.02  # probability from which on a shape is divided
@@ -44,7 +58,71 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
         left = [problem.columns[k] for k in sorted(kept - {*counts})]
         problem = problem.with_columns([*left, *finer])
     problem = _with_likeliest_length(readings, problem.columns)
-    return problem, hypotheses_of(problem)
+    cells = hypotheses_of(problem)
+    beside_laws = with_levels_of_laws(problem, cells)
+    if beside_laws is problem:
+        return problem, cells
+    return beside_laws, hypotheses_of(beside_laws)
+
+
+def with_levels_of_laws(problem: Problem, cells: list[Cell]) -> Problem:
+    """The problem with the level errors that are likeliest beside laws, too.
+
+    Smooth curves know no laws: what changes steeply with amplitude, such as friction, is half taken
+    for errors of levels, and these would hide it. The likeliest of the hypotheses say what is left.
+    """
+    states = problem.readings.posterior.states
+    free = np.array(states.level_std) == 0
+    if states.n_levels < 2 or not free.any():
+        return problem
+    best: dict[tuple[int, ...], Cell] = {}
+    for cell in cells:
+        if cell.columns:
+            best.setdefault(tuple(sorted(cell.columns)), cell)
+    likely = itertools.islice(best.values(), _LAWS)
+    found = [_levels_beside(problem, cell, free) for cell in likely]
+    gained, levels, log_prior = max(found, default=(0.0, AS_CURVES_LEAVE, 0.0))
+    if gained < _WORTH:
+        return problem
+    whole = float(np.logaddexp(0.0, log_prior))
+    either = (AS_CURVES_LEAVE, -whole), (levels, log_prior - whole)
+    return problem._replace(levels=either)
+
+
+def _levels_beside(
+    problem: Problem, cell: Cell, free: Bool[np.ndarray, " kind"]
+) -> tuple[float, LevelSizes, float]:
+    """Sizes of level errors beside laws: nats that they gain, the sizes, and ln of their prior."""
+    alone = problem.with_columns([problem.columns[k] for k in cell.columns])
+    own, *others = alone.blocks
+    higher = [
+        LawSums.of(alone.columns, block, (size,))
+        for block, size in zip(others, cell.sizes[2:], strict=True)
+    ]
+    scale = np.array([prior.scale for prior in LEVELS])
+    over = (problem.readings.level_std / scale)[free]
+
+    def prior(logs: np.ndarray) -> float:
+        return float(np.sum(logs) - 0.5 * np.sum((over * np.exp(logs)) ** 2 - over**2))
+
+    def levels_at(logs: np.ndarray) -> LevelSizes:
+        values = np.ones(4)
+        values[free] = np.exp(logs)
+        gain, phase, stiffness, damping = values.tolist()
+        return gain, phase, stiffness, damping
+
+    def fall(logs: np.ndarray) -> float:
+        sums = LawSums.of(alone.columns, own, cell.sizes[:2], (levels_at(logs), prior(logs)))
+        whole = functools.reduce(LawSums.with_rows_of, higher, sums)
+        if len(cell.columns) == 1:
+            return -whole.base - float(whole.gains(whole.b, np.diag(whole.gram), 1)[0])
+        both = whole.together(tuple(range(len(cell.columns))))
+        return _UNSEEN if both is None else -both.log_evidence
+
+    start = np.zeros(np.count_nonzero(free))
+    ends = [(_LEAST_OF_LEVELS, -_LEAST_OF_LEVELS)] * len(start)
+    best = minimize(fall, start, method="L-BFGS-B", bounds=ends, options={"maxiter": 20})
+    return fall(start) - float(best.fun), levels_at(best.x), prior(best.x)
 
 
 def _with_likeliest_length(readings: Readings, columns: list[Column]) -> Problem:
@@ -90,15 +168,21 @@ class _Grid(NamedTuple):
         """With every size of remainders, or some: `every` second one."""
         sizes = sizes_of_remainders(every)
         own, *others = problem.blocks
-        sums = [LawSums.of(problem.columns, own, s) for s in itertools.product(sizes, sizes)]
+        sums = [
+            LawSums.of(problem.columns, own, both, levels)
+            for both in itertools.product(sizes, sizes)
+            for levels in problem.levels
+        ]
         return cls(sums, _of_harmonics(problem.columns, others, every))
 
-    def singles(self) -> Iterator[tuple[list[Sizes], np.ndarray, np.ndarray]]:
-        """Sizes, ln evidence without a law, and of every law alone, by combination of sizes."""
+    def singles(self) -> Iterator[tuple[list[Cell], np.ndarray]]:
+        """Hypotheses without a law, and ln evidence of every law alone, by combination of sizes."""
         of_higher = HarmonicSums.of(self.higher)
         for own in self.own:
             sizes = [own.sizes if one is None else (*own.sizes, *one.sizes) for one in self.higher]
-            yield sizes, *of_higher.singles(own)
+            base, value = of_higher.singles(own)
+            none = [Cell(v, (), s, own.levels) for v, s in zip(base.tolist(), sizes, strict=True)]
+            yield none, value
 
     def coarse(self) -> list[LawSums]:
         """Of fundamentals, for the sizes that several laws are tried with."""
@@ -108,7 +192,10 @@ class _Grid(NamedTuple):
 
 def _log_evidence_of_singles(problem: Problem) -> float:
     """ln of the probability of the rows with one law or none."""
-    each = [np.append(value, base) for _, base, value in _Grid.of(problem, 2).singles()]
+    each = [
+        np.append(value, [cell.log_evidence for cell in none])
+        for none, value in _Grid.of(problem, 2).singles()
+    ]
     return float(logsumexp(np.concatenate(each)))
 
 
@@ -123,12 +210,12 @@ def _weighed(
     grid = _Grid.of(problem, every)
     cells: list[Cell] = []
     alone = np.full(len(problem.columns), -np.inf)
-    for sizes, base, value in grid.singles():
+    for none, value in grid.singles():
         alone = np.maximum(alone, np.max(value, axis=0, initial=-np.inf))
-        cells += [Cell(float(v), (), s) for v, s in zip(base, sizes, strict=True)]
+        cells += none
         best = max(cell.log_evidence for cell in cells)
         for one, k in np.argwhere(value > best - reach).tolist():
-            cells.append(Cell(float(value[one, k]), (k,), sizes[one]))
+            cells.append(none[one]._replace(log_evidence=float(value[one, k]), columns=(k,)))
     best = max(cell.log_evidence for cell in cells)
     prior = grid.own[0].prior_of_pairs()
     bounds = [0.0 if other is None else other.most() for other in grid.higher]
@@ -160,14 +247,14 @@ def _with_one_more(cells: list[Cell], grid: _Grid, n_laws: int, least: float) ->
     for cell in sorted(cells, key=lambda cell: -cell.log_evidence):
         if len(cell.columns) == n_laws - 1:
             fewer.setdefault(tuple(sorted(cell.columns)), cell)
-    found: dict[tuple[tuple[int, ...], Sizes], Cell] = {}
+    found: dict[tuple[tuple[int, ...], Sizes, LevelSizes], Cell] = {}
     for one in itertools.islice(fewer.values(), _GONE_ON):
         (other,) = (h for h in grid.higher if (() if h is None else h.sizes) == one.sizes[2:])
         for own in grid.coarse():
             whole = own if other is None else own.with_rows_of(other)
             again = whole.together(one.columns)
             for cell in () if again is None else whole.with_one_more(again, least):
-                found.setdefault((tuple(sorted(cell.columns)), cell.sizes), cell)
+                found.setdefault((tuple(sorted(cell.columns)), cell.sizes, cell.levels), cell)
     return list(found.values())
 
 

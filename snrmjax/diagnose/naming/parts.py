@@ -107,6 +107,15 @@ class _Read(NamedTuple):
     laws: dict[str, Laws]  # that are seen, by part
     left: dict[str, bool]  # whether a remainder is seen
 
+    @property
+    def drawn(self) -> bool:
+        """Whether a remainder is seen in any part."""
+        return any(self.left.values())
+
+    def instead(self, part: str) -> Laws:
+        """Instruments' errors with which a part shows neither a law nor a remainder."""
+        return () if self.laws[part] or self.left[part] else self.laws["instrument"]
+
 
 def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     """What explains most of a test's readings."""
@@ -126,6 +135,11 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     with_all = [one for one in reads if wanted <= {k for some in one.laws.values() for k in some}]
     best = max(with_all or reads, key=lambda one: one.weight)
     parts = [_part(problem, reads, part, best, classes[part]) for part in classes]
+    nothing = sum(one.weight for one in reads if not (any(one.laws.values()) or one.drawn))
+    if nothing < 0.5 and all(part.verdict == "none" for part in parts):
+        # Something is there: an instrument's error that is not certain, or no part has half of it.
+        k = -1 if parts[-1].effects else int(np.argmin([part.probability for part in parts[:-1]]))
+        parts[k] = parts[k]._replace(verdict="drawn")
     linear, (softer, lossier) = problem.readings.linear, best.solved.linear
     return Naming(
         *(tuple(parts), answers, _parameters(problem, best, wanted), best.solved.misfit),
@@ -281,7 +295,12 @@ def _part(
     """Which laws change a part, by how probable each is among all hypotheses."""
     effects, candidates, probability = found
     none = sum(one.weight for one in reads if not one.laws[part])
-    silent = sum(one.weight for one in reads if not one.laws[part] and not one.left[part])
+    instead = {law for group in candidates for law in group}
+    silent = sum(
+        one.weight
+        for one in reads
+        if not (one.laws[part] or one.left[part] or instead & {*one.instead(part)})
+    )
     if part == "instrument":
         verdict = "none"
         if probability >= priors.NAMED:
@@ -307,10 +326,11 @@ def _part(
 
 def _classes(reads: list[_Read], part: str) -> tuple[Laws, tuple[Laws, ...], float]:
     """Effects of a part with the laws that may stand in their place, and their probability."""
-    inclusion: dict[str, float] = {}
-    for one in reads:
-        for law in one.laws[part]:
-            inclusion[law] = inclusion.get(law, 0.0) + one.weight
+    inclusion = _inclusion(reads, lambda one: one.laws[part])
+    most = max(inclusion.values(), default=0.0)
+    if part in DRAWN and 1 - priors.NAMED < most < priors.NAMED:
+        reads = _with_instruments(reads, part, max(inclusion, key=lambda law: inclusion[law]))
+        inclusion = _inclusion(reads, lambda one: one.laws[part])
     ranked = sorted(inclusion, key=lambda law: -inclusion[law])
     if not ranked or sum(one.weight for one in reads if one.laws[part]) < 0.5:
         return (), (), 0.0
@@ -332,6 +352,36 @@ def _classes(reads: list[_Read], part: str) -> tuple[Laws, tuple[Laws, ...], flo
         if all(any(law in one.laws[part] for law in group) for group in groups)
     )
     return tuple(group[0] for group in groups), tuple(groups), float(probability)
+
+
+def _inclusion(reads: list[_Read], laws: Callable[[_Read], Laws]) -> dict[str, float]:
+    """Probability of every law."""
+    found: dict[str, float] = {}
+    for one in reads:
+        for law in laws(one):
+            found[law] = found.get(law, 0.0) + one.weight
+    return found
+
+
+def _with_instruments(reads: list[_Read], part: str, law: str) -> list[_Read]:
+    """Instruments' errors that stand in the place of a part's law count as one of its laws.
+
+    As an offset of the force does at resonance, where it does what friction does: neither is
+    certain then, and one or the other is.
+    """
+    wholes = _inclusion(reads, lambda one: one.laws["instrument"])
+    own = _inclusion(reads, lambda one: one.instead(part))
+    both = _inclusion(reads, lambda one: one.laws["instrument"] if law in one.laws[part] else ())
+    rivals = {
+        kind
+        for kind, p in own.items()
+        if p >= 0.02 and wholes[kind] < priors.NAMED and both.get(kind, 0.0) < 0.5 * p
+    }
+    laws = ({*one.laws[part], *(rivals & {*one.instead(part)})} for one in reads)
+    return [
+        one._replace(laws={**one.laws, part: tuple(sorted(some))})
+        for one, some in zip(reads, laws, strict=True)
+    ]
 
 
 def _explained(

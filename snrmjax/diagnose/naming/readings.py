@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from snrmjax.diagnose import priors
 from snrmjax.identify.test_model.balance import Balance, whitening
@@ -83,6 +83,8 @@ class Readings(NamedTuple):
     beyond: Complex[np.ndarray, " state"]  # Z less that of the model, 1/s²
     rows: Float[np.ndarray, " row"]  # Z less that of the model, whitened
     errors: Float[np.ndarray, "row error"]  # of levels, modal mass, linear test: by their own 1σ
+    levels: Int[np.ndarray, "kind level"]  # columns of `errors` that are of levels
+    level_std: Float[np.ndarray, " kind"]  # 1σ that these have
     posterior: TestPosterior
     harmonics: tuple[HarmonicReading, ...] = ()
 
@@ -179,6 +181,7 @@ def readings_of(
     columns.append(2j * omega * natural * linear.damping_std)
     sizes = np.hypot(found.hyper.level_std, [priors.FLOOR, priors.FLOOR, 0.0, 0.0])
     columns += [one - known for one in moved]
+    of_level = len(columns) + np.arange(4 * states.n_levels).reshape(4, -1)
     for kind, (column, size) in enumerate(zip(of_levels, sizes, strict=True)):
         if kind < 2:  # of which the records were corrected
             rows = rows + column * found.level_errors[states.level, kind]
@@ -190,6 +193,7 @@ def readings_of(
     none, slope = np.empty(0), now.slope
     bare = Readings(
         *(linear, now.velocity, omega, now.force, order, now.z, slope, root, rows, none, none),
+        *(of_level, sizes),
         posterior=found,
     )
     higher = () if recorded is None else _higher(linear, states, now.velocity, motion, recorded)

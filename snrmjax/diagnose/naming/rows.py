@@ -6,7 +6,7 @@ Fundamentals and every other harmonic are blocks of rows that have nothing but t
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from scipy.linalg import block_diag, solve_triangular
 
 from snrmjax.diagnose import priors
@@ -21,6 +21,9 @@ CURVES = "stiffness", "damping"
 """Parts that are curves of amplitude; the others are harmonics."""
 
 Sizes = tuple[float, ...]
+LevelSizes = tuple[float, float, float, float]
+"""Of level errors of gain, phase, stiffness and damping, over those that smooth curves leave."""
+AS_CURVES_LEAVE: LevelSizes = (1.0, 1.0, 1.0, 1.0)
 
 
 class Cell(NamedTuple):
@@ -29,6 +32,7 @@ class Cell(NamedTuple):
     log_evidence: float  # times the prior
     columns: tuple[int, ...]  # places in `Problem.columns`
     sizes: Sizes  # σ of the remainders of stiffness, damping and every other harmonic
+    levels: LevelSizes = AS_CURVES_LEAVE
 
 
 class RowBlock(NamedTuple):
@@ -37,6 +41,7 @@ class RowBlock(NamedTuple):
     rows: Float[np.ndarray, " row"]
     design: Float[np.ndarray, "row unknown"]  # errors, then remainders of size 1
     groups: tuple[int, ...]  # how many unknowns are errors, and functions of every remainder
+    levels: Int[np.ndarray, "kind level"]  # errors that are of levels
     directions: Float[np.ndarray, "row direction"]  # of the design, orthogonal
     triangle: Float[np.ndarray, "direction unknown"]
     laws: Float[np.ndarray, "row column"]
@@ -49,12 +54,14 @@ class RowBlock(NamedTuple):
         rows: Float[np.ndarray, " row"],
         errors: Float[np.ndarray, "row error"],
         *remainders: Float[np.ndarray, "row function"],
+        levels: Int[np.ndarray, "kind level"] | None = None,
     ) -> "RowBlock":
         """A block without laws."""
+        of_level = np.zeros((4, 0), int) if levels is None else levels
         design = np.hstack([errors, *remainders])
         groups = errors.shape[1], *(one.shape[1] for one in remainders)
         none = np.empty((0, 0))
-        return cls(rows, design, groups, *np.linalg.qr(design), none, none, none)
+        return cls(rows, design, groups, of_level, *np.linalg.qr(design), none, none, none)
 
     def with_laws(self, laws: Float[np.ndarray, "row column"]) -> "RowBlock":
         """The same with the columns of laws."""
@@ -63,9 +70,13 @@ class RowBlock(NamedTuple):
         left = both - self.directions @ along
         return self._replace(laws=laws, along=along, across=left.T @ left)
 
-    def variances(self, sizes: Sizes) -> Float[np.ndarray, " unknown"]:
+    def variances(
+        self, sizes: Sizes, levels: LevelSizes = AS_CURVES_LEAVE
+    ) -> Float[np.ndarray, " unknown"]:
         """Prior variances of the design's unknowns."""
-        return np.repeat([1.0, *(size**2 for size in sizes)], self.groups)
+        values = np.repeat([1.0, *(size**2 for size in sizes)], self.groups)
+        values[self.levels] = np.square(levels)[:, None]
+        return values
 
 
 class Problem(NamedTuple):
@@ -76,6 +87,7 @@ class Problem(NamedTuple):
     functions: dict[str, Float[np.ndarray, "state function"]]  # of every part's remainder of size 1
     blocks: tuple[RowBlock, ...]  # fundamentals, then every other harmonic
     length: float  # of ln a, over which remainders of stiffness and damping change
+    levels: tuple[tuple[LevelSizes, float], ...] = ((AS_CURVES_LEAVE, 0.0),)  # and their ln p
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -106,7 +118,8 @@ def problem_of(readings: Readings, columns: list[Column], length: float) -> Prob
     curves = natural**2 * functions[CURVES[0]].T
     lossy = 1j * readings.relative_frequency * curves
     remainders = readings.whitened(curves).T, readings.whitened(lossy).T
-    blocks = [RowBlock.of(readings.rows, readings.errors, *remainders)]
+    errors = readings.errors
+    blocks = [RowBlock.of(readings.rows, errors, *remainders, levels=readings.levels)]
     for one in readings.harmonics:
         both = _of_harmonic(x, x, length)
         functions[f"harmonic_{one.order}"] = both
@@ -171,7 +184,7 @@ def solved(problem: Problem, cell: Cell) -> Solved:
     kept, first = [np.ones(len(laws), bool)], 2
     for place, block in enumerate(blocks):
         sizes = cell.sizes[:first] if place == 0 else cell.sizes[first + place - 1 :][:1]
-        variances.append(block.variances(sizes))
+        variances.append(block.variances(sizes, cell.levels))
         kept.append(np.repeat([False, True], [block.groups[0], sum(block.groups[1:])]))
     root, remain = np.sqrt(np.concatenate(variances)), np.concatenate(kept)
     q, r = np.linalg.qr(np.vstack([design * root, np.eye(len(root))]))
