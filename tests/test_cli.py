@@ -495,7 +495,7 @@ def test_a_joint_fit_writes_the_files_of_the_contract(fitted):
     for fraction in ("frequency_fraction", "damping_fraction"):
         assert sum(row[fraction] for row in fit["contributions"]) == pytest.approx(1, rel=1e-9)
     html = (out / "report.html").read_text()
-    for heading in ("Joint fit", "What the bands are made of", "What to measure next"):
+    for heading in ("Joint fit", "Contributions to the bands", "What to measure next"):
         assert f"<h2>{heading}</h2>" in html
     with (out / "next.csv").open() as file:
         reasons = [row["reason"] for row in csv.DictReader(file)]

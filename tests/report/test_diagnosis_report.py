@@ -271,7 +271,7 @@ def test_the_terminal_has_what_was_found_with_its_error_and_unit(drag):
     given, _, found = drag
     value, std = found.parameters["quadratic_damping.coefficient"]
     (line,) = (one for one in told.headline(DiagnosedTest(found, given)) if "± 1σ" in one)
-    words = r"found \(± 1σ\): quadratic damping, coefficient (\S+) ± (\S+) 1/\(√kg m\)"
+    words = r"identified \(± 1σ\): quadratic damping, coefficient (\S+) ± (\S+) 1/\(√kg m\)"
     printed = re.fullmatch(words, line)
     assert printed
     # To two digits of the error.

@@ -233,7 +233,7 @@ def test_folded_tables_show_one_line_until_they_are_opened():
 
 def test_report_without_anything_to_remark(tmp_path):
     html = reports.report_html(Report("Empty"))
-    assert "Nothing to remark." in html
+    assert "No remarks." in html
     assert re.findall(r"<h2>(.*?)</h2>", html) == ["Notes"]
     parsed(html)
 

@@ -115,10 +115,10 @@ def test_events_are_drawn_over_their_parameter():
     frequencies, speeds = figure.axes
     assert frequencies.get_xlabel() == "Force (N)"
     assert speeds.get_ylabel() == "Velocity amplitude (m/s)"
-    assert legend_names(figure) == {"fold", "peak", "turn of the parameter"}
+    assert legend_names(figure) == {"fold", "peak", "turning point"}
     np.testing.assert_allclose(named(frequencies, "fold").get_ydata(), folds.frequency / HERTZ)
     (k,) = folds.at_events("cusp")
-    turn = named(speeds, "turn of the parameter")
+    turn = named(speeds, "turning point")
     np.testing.assert_allclose(turn.get_xydata(), [[folds.value[k], folds.amplitude[k]]])
     damped = followed("peak", "mode_1.damping_ratio", (0.02, 0.05))
     assert damped.plot().axes[0].get_xlabel() == "mode_1.damping_ratio"

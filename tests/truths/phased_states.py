@@ -12,14 +12,20 @@ from snrmjax.model.effects import EFFECTS
 OMEGA, RATIO, SHAPE = 500.0, 0.01, 2.0
 
 
-def states_of(stiffness, damping, *, noise=2e-3, seed=0, levels=5):
+PHASES = (-60.0, -40, -20, 0, 20, 40, 60)
+LEVEL_STD = (1e-3, 1e-3, 1e-4, 1e-3)
+
+
+def states_of(
+    stiffness, damping, *, noise=2e-3, seed=0, levels=5, phases=PHASES, level_std=LEVEL_STD
+):
     """States of one mode at some levels of amplitude, off resonance by set phases, with noise.
 
     Arguments: relative changes of ω₀² and of 2ζ as functions of amplitude over the largest.
     """
     rng = np.random.default_rng(seed)
     amplitude = np.geomspace(1e-4, 1e-3, levels)
-    phase = np.radians([-60.0, -40, -20, 0, 20, 40, 60])
+    phase = np.radians(phases)
     a, turn = (part.ravel() for part in np.meshgrid(amplitude, phase, indexing="ij"))
     level = np.repeat(np.arange(levels), len(phase))
     x = a / a.max()
@@ -36,7 +42,7 @@ def states_of(stiffness, damping, *, noise=2e-3, seed=0, levels=5):
     velocity = velocity * np.exp(noise * (rng.normal(size=a.size) + 1j * rng.normal(size=a.size)))
     errors = np.tile([0.1 * noise, noise, noise], (a.size, 1))
     return test_states.TestStates(
-        *(level, omega, force, velocity, errors, True, constant, (1e-3, 1e-3, 1e-4, 1e-3), 0.01)
+        *(level, omega, force, velocity, errors, True, constant, level_std, 0.01)
     )
 
 

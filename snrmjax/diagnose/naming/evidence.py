@@ -15,7 +15,14 @@ from scipy.special import log_ndtr, logsumexp
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column, odds_of
-from snrmjax.diagnose.naming.rows import Cell, Problem, RemainderStds, RowBlock
+from snrmjax.diagnose.naming.rows import (
+    WITHOUT_LAWS,
+    Cell,
+    LevelStds,
+    Problem,
+    RemainderStds,
+    RowBlock,
+)
 from snrmjax.model.library.measurement_chain import ForceHarmonics
 
 _ALIKE = 2 * (priors.BAND * priors.DESCRIBED) ** 2  # least sin² of the angle between two laws
@@ -38,6 +45,7 @@ class LawSums(NamedTuple):
     """b and S of all columns, for given standard deviations of the remainders."""
 
     remainder_std: RemainderStds
+    level_std: LevelStds
     base: float  # ln p of the rows without any law, times the prior of `remainder_std`
     b: Float[np.ndarray, " column"]
     gram: Float[np.ndarray, "column column"]
@@ -47,9 +55,15 @@ class LawSums(NamedTuple):
     prior: Float[np.ndarray, " column"]  # probability among single laws
 
     @classmethod
-    def of(cls, columns: list[Column], block: RowBlock, remainder_std: RemainderStds) -> "LawSums":
-        """From one Cholesky factor."""
-        root = block.triangle * np.sqrt(block.variances(remainder_std))
+    def of(
+        cls,
+        columns: list[Column],
+        block: RowBlock,
+        remainder_std: RemainderStds,
+        levels: tuple[LevelStds, float] = (WITHOUT_LAWS, 0.0),
+    ) -> "LawSums":
+        """From one Cholesky factor; `levels`: 1σ of level errors, and ln of their prior."""
+        root = block.triangle * np.sqrt(block.variances(remainder_std, levels[0]))
         factor = cholesky(root @ root.T + np.eye(len(root)), lower=True)
         white = solve_triangular(factor, block.along, lower=True)
         gram = block.across + white.T @ white
@@ -60,7 +74,8 @@ class LawSums(NamedTuple):
         return cls(
             *(
                 remainder_std,
-                base + _log_prior(remainder_std),
+                levels[0],
+                base + _log_prior(remainder_std) + levels[1],
                 gram[:-1, -1],
                 gram[:-1, :-1],
                 np.array(kinds),
@@ -117,7 +132,8 @@ class LawSums(NamedTuple):
         )
         value = np.concatenate(values) + self.base + prior
         keep = np.flatnonzero(value > least)
-        return [Cell(float(value[k]), (int(i[k]), int(j[k])), self.remainder_std) for k in keep]
+        stds = self.remainder_std, self.level_std
+        return [Cell(float(value[k]), (int(i[k]), int(j[k])), *stds) for k in keep]
 
     def together(self, columns: tuple[int, ...]) -> Cell | None:
         """Several laws as one hypothesis; None if any is insignificant with the others."""
@@ -148,7 +164,9 @@ class LawSums(NamedTuple):
         further[own] = False
         significant = apart & (b**2 > priors.VISIBLE**2 * square)
         some = np.flatnonzero(further & significant & (value > least)).tolist()
-        return [Cell(float(value[k]), (*cell.columns, k), cell.remainder_std) for k in some]
+        return [
+            cell._replace(log_evidence=float(value[k]), columns=(*cell.columns, k)) for k in some
+        ]
 
     def gains(
         self,
@@ -231,7 +249,8 @@ def _log_half(sign: np.ndarray, standardised: np.ndarray) -> np.ndarray:
 
 def detectable_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.ndarray, " column"]:
     """Detectable strength of each column in addition to a hypothesis."""
-    normal = LawSums.of(problem.columns, problem.blocks[0], cell.remainder_std[:2])
+    first = cell.remainder_std[:2], (cell.level_std, 0.0)
+    normal = LawSums.of(problem.columns, problem.blocks[0], *first)
     for block, std in zip(problem.blocks[1:], cell.remainder_std[2:], strict=True):
         normal = normal.with_rows_of(LawSums.of(problem.columns, block, (std,)))
     some, n_rows = list(cell.columns), sum(len(block.rows) for block in problem.blocks)

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from snrmjax.diagnose import priors
@@ -21,7 +22,16 @@ from snrmjax.diagnose.naming.evidence import (
     remainder_stds,
 )
 from snrmjax.diagnose.naming.readings import Readings
-from snrmjax.diagnose.naming.rows import Cell, Problem, RemainderStds, RowBlock, problem_of
+from snrmjax.diagnose.naming.rows import (
+    WITHOUT_LAWS,
+    Cell,
+    LevelStds,
+    Problem,
+    RemainderStds,
+    RowBlock,
+    problem_of,
+)
+from snrmjax.identify.test_model.priors import LEVELS
 
 _ROUNDS = 3  # of refined shapes
 _COARSE = 40.0  # nats that a coarse shape may be below the best
@@ -29,6 +39,10 @@ _REACH = 16.0  # nats below the best within which a column is kept while shapes 
 _COUNTS = 0.02  # probability from which on a shape is refined
 _EXTENDED = 4  # sets of laws that are extended by one more
 _LEAST = 8.0  # nats below the most probable answer within which hypotheses are kept
+_REFITTED = 4  # sets of laws with which level errors are estimated again
+_WORTH = 1.0  # nats gained, from which on hypotheses are compared with these as well
+_SMALLEST = np.log(0.05)  # ln of the factor by which level errors may become smaller
+_UNSEEN = 1e6  # nats lost where one of the laws is not significant next to the others
 
 
 def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, list[Cell]]:
@@ -44,7 +58,71 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
         left = [problem.columns[k] for k in sorted(kept - {*counts})]
         problem = problem.with_columns([*left, *finer])
     problem = _with_likeliest_length(readings, problem.columns)
-    return problem, hypotheses_of(problem)
+    cells = hypotheses_of(problem)
+    with_laws = with_level_errors_of_laws(problem, cells)
+    if with_laws is problem:
+        return problem, cells
+    return with_laws, hypotheses_of(with_laws)
+
+
+def with_level_errors_of_laws(problem: Problem, cells: list[Cell]) -> Problem:
+    """The problem with an alternative: level errors as estimated together with laws.
+
+    Smooth curves attribute half of a steep change, such as that of friction, to errors of the
+    levels, which would then hide the law. The best hypotheses estimate them again.
+    """
+    states = problem.readings.posterior.states
+    free = np.array(states.level_std) == 0
+    if states.n_levels < 2 or not free.any():
+        return problem
+    best: dict[tuple[int, ...], Cell] = {}
+    for cell in cells:
+        if cell.columns:
+            best.setdefault(tuple(sorted(cell.columns)), cell)
+    likely = itertools.islice(best.values(), _REFITTED)
+    refitted = [_level_errors_with(problem, cell, free) for cell in likely]
+    gained, stds, log_prior = max(refitted, default=(0.0, WITHOUT_LAWS, 0.0))
+    if gained < _WORTH:
+        return problem
+    whole = float(np.logaddexp(0.0, log_prior))
+    both = (WITHOUT_LAWS, -whole), (stds, log_prior - whole)
+    return problem._replace(level_stds=both)
+
+
+def _level_errors_with(
+    problem: Problem, cell: Cell, free: Bool[np.ndarray, " kind"]
+) -> tuple[float, LevelStds, float]:
+    """Level errors with the laws of a hypothesis: nats gained, their 1σ, and ln of their prior."""
+    alone = problem.with_columns([problem.columns[k] for k in cell.columns])
+    own, *others = alone.blocks
+    higher = [
+        LawSums.of(alone.columns, block, (std,))
+        for block, std in zip(others, cell.remainder_std[2:], strict=True)
+    ]
+    scale = np.array([prior.scale for prior in LEVELS])
+    relative = (problem.readings.level_std / scale)[free]
+
+    def log_prior(logs: np.ndarray) -> float:
+        return float(np.sum(logs) - 0.5 * np.sum((relative * np.exp(logs)) ** 2 - relative**2))
+
+    def stds(logs: np.ndarray) -> LevelStds:
+        values = np.ones(4)
+        values[free] = np.exp(logs)
+        gain, phase, stiffness, damping = values.tolist()
+        return gain, phase, stiffness, damping
+
+    def loss(logs: np.ndarray) -> float:
+        sums = LawSums.of(alone.columns, own, cell.remainder_std[:2], (stds(logs), log_prior(logs)))
+        whole = functools.reduce(LawSums.with_rows_of, higher, sums)
+        if len(cell.columns) == 1:
+            return -whole.base - float(whole.gains(whole.b, np.diag(whole.gram), 1)[0])
+        together = whole.together(tuple(range(len(cell.columns))))
+        return _UNSEEN if together is None else -together.log_evidence
+
+    start = np.zeros(np.count_nonzero(free))
+    bounds = [(_SMALLEST, -_SMALLEST)] * len(start)
+    fit = minimize(loss, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 20})
+    return loss(start) - float(fit.fun), stds(fit.x), log_prior(fit.x)
 
 
 def _with_likeliest_length(readings: Readings, columns: list[Column]) -> Problem:
@@ -90,18 +168,24 @@ class _Grid(NamedTuple):
         """With each `every`-th standard deviation of the remainders."""
         stds = remainder_stds(every)
         own, *others = problem.blocks
-        sums = [LawSums.of(problem.columns, own, s) for s in itertools.product(stds, stds)]
+        sums = [
+            LawSums.of(problem.columns, own, both, levels)
+            for both in itertools.product(stds, stds)
+            for levels in problem.level_stds
+        ]
         return cls(sums, _of_harmonics(problem.columns, others, every))
 
-    def singles(self) -> Iterator[tuple[list[RemainderStds], np.ndarray, np.ndarray]]:
-        """Remainders, and ln evidence without a law and of every law alone, by combination."""
+    def singles(self) -> Iterator[tuple[list[Cell], np.ndarray]]:
+        """Hypotheses without a law, and ln evidence of every law alone, by combination."""
         of_higher = HarmonicSums.of(self.higher)
         for own in self.own:
             stds = [
                 own.remainder_std if one is None else (*own.remainder_std, *one.remainder_std)
                 for one in self.higher
             ]
-            yield stds, *of_higher.singles(own)
+            base, value = of_higher.singles(own)
+            pairs = zip(base.tolist(), stds, strict=True)
+            yield [Cell(p, (), std, own.level_std) for p, std in pairs], value
 
     def coarse(self) -> list[LawSums]:
         """Sums of fundamentals on the coarser grid, for several laws."""
@@ -111,7 +195,10 @@ class _Grid(NamedTuple):
 
 def _log_evidence_of_singles(problem: Problem) -> float:
     """ln of the probability of the rows with one law or none."""
-    each = [np.append(value, base) for _, base, value in _Grid.of(problem, 2).singles()]
+    each = [
+        np.append(value, [cell.log_evidence for cell in none])
+        for none, value in _Grid.of(problem, 2).singles()
+    ]
     return float(logsumexp(np.concatenate(each)))
 
 
@@ -126,12 +213,12 @@ def _compared(
     grid = _Grid.of(problem, every)
     cells: list[Cell] = []
     alone = np.full(len(problem.columns), -np.inf)
-    for stds, base, value in grid.singles():
+    for none, value in grid.singles():
         alone = np.maximum(alone, np.max(value, axis=0, initial=-np.inf))
-        cells += [Cell(float(v), (), s) for v, s in zip(base, stds, strict=True)]
+        cells += none
         best = max(cell.log_evidence for cell in cells)
         for one, k in np.argwhere(value > best - reach).tolist():
-            cells.append(Cell(float(value[one, k]), (k,), stds[one]))
+            cells.append(none[one]._replace(log_evidence=float(value[one, k]), columns=(k,)))
     best = max(cell.log_evidence for cell in cells)
     prior = grid.own[0].prior_of_pairs()
     bounds = [0.0 if other is None else other.bound() for other in grid.higher]
@@ -163,7 +250,7 @@ def _with_one_more(cells: list[Cell], grid: _Grid, n_laws: int, least: float) ->
     for cell in sorted(cells, key=lambda cell: -cell.log_evidence):
         if len(cell.columns) == n_laws - 1:
             fewer.setdefault(tuple(sorted(cell.columns)), cell)
-    extended: dict[tuple[tuple[int, ...], RemainderStds], Cell] = {}
+    extended: dict[tuple[tuple[int, ...], RemainderStds, LevelStds], Cell] = {}
     for one in itertools.islice(fewer.values(), _EXTENDED):
         (other,) = (
             h
@@ -174,7 +261,8 @@ def _with_one_more(cells: list[Cell], grid: _Grid, n_laws: int, least: float) ->
             whole = own if other is None else own.with_rows_of(other)
             again = whole.together(one.columns)
             for cell in () if again is None else whole.with_one_more(again, least):
-                extended.setdefault((tuple(sorted(cell.columns)), cell.remainder_std), cell)
+                key = tuple(sorted(cell.columns)), cell.remainder_std, cell.level_std
+                extended.setdefault(key, cell)
     return list(extended.values())
 
 

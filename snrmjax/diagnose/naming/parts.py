@@ -107,6 +107,15 @@ class _Assessed(NamedTuple):
     laws: dict[str, Laws]  # significant ones, by part
     left: dict[str, bool]  # whether the remainder is significant, by part
 
+    @property
+    def changes_nothing(self) -> bool:
+        """Whether no part has a significant law or remainder."""
+        return not (any(self.laws.values()) or any(self.left.values()))
+
+    def instead(self, part: str) -> Laws:
+        """Instrument errors with which a part needs neither a law nor a remainder."""
+        return () if self.laws[part] or self.left[part] else self.laws["instrument"]
+
 
 def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     """The answer by parts from the hypotheses of a test's readings."""
@@ -131,6 +140,11 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     ]
     best = max(with_all or assessed, key=lambda one: one.weight)
     parts = [_part(problem, assessed, part, best, classes[part]) for part in classes]
+    nothing = sum(one.weight for one in assessed if one.changes_nothing)
+    if nothing < 0.5 and all(part.verdict == "none" for part in parts):
+        # A probable instrument error, or a change of which no part alone is probable.
+        k = -1 if parts[-1].effects else int(np.argmin([part.probability for part in parts[:-1]]))
+        parts[k] = parts[k]._replace(verdict="drawn")
     linear, (stiffness_error, damping_error) = problem.readings.linear, best.solved.linear
     return Naming(
         *(tuple(parts), answers, _parameters(problem, best, wanted), best.solved.misfit),
@@ -288,7 +302,12 @@ def _part(
     """The answer for a part, from the probabilities of laws over all hypotheses."""
     effects, candidates, probability = answer
     none = sum(one.weight for one in assessed if not one.laws[part])
-    unchanged = sum(one.weight for one in assessed if not one.laws[part] and not one.left[part])
+    alternatives = {law for group in candidates for law in group}
+    unchanged = sum(
+        one.weight
+        for one in assessed
+        if not (one.laws[part] or one.left[part] or alternatives & {*one.instead(part)})
+    )
     if part == "instrument":
         verdict = "none"
         if probability >= priors.NAMED:
@@ -314,10 +333,12 @@ def _part(
 
 def _classes(assessed: list[_Assessed], part: str) -> tuple[Laws, tuple[Laws, ...], float]:
     """Effects of a part with their alternatives, and their joint probability."""
-    inclusion: dict[str, float] = {}
-    for one in assessed:
-        for law in one.laws[part]:
-            inclusion[law] = inclusion.get(law, 0.0) + one.weight
+    inclusion = _inclusion(assessed, lambda one: one.laws[part])
+    most = max(inclusion.values(), default=0.0)
+    if part in DRAWN and 1 - priors.NAMED < most < priors.NAMED:
+        law = max(inclusion, key=lambda law: inclusion[law])
+        assessed = _with_instrument_errors(assessed, part, law)
+        inclusion = _inclusion(assessed, lambda one: one.laws[part])
     ranked = sorted(inclusion, key=lambda law: -inclusion[law])
     if not ranked or sum(one.weight for one in assessed if one.laws[part]) < 0.5:
         return (), (), 0.0
@@ -341,6 +362,36 @@ def _classes(assessed: list[_Assessed], part: str) -> tuple[Laws, tuple[Laws, ..
         if all(any(law in one.laws[part] for law in group) for group in groups)
     )
     return tuple(group[0] for group in groups), tuple(groups), float(probability)
+
+
+def _inclusion(assessed: list[_Assessed], laws: Callable[[_Assessed], Laws]) -> dict[str, float]:
+    """Inclusion probability of every law."""
+    inclusion: dict[str, float] = {}
+    for one in assessed:
+        for law in laws(one):
+            inclusion[law] = inclusion.get(law, 0.0) + one.weight
+    return inclusion
+
+
+def _with_instrument_errors(assessed: list[_Assessed], part: str, law: str) -> list[_Assessed]:
+    """Instrument errors that are alternatives of a part's law count as one of its laws.
+
+    At resonance an offset of the force has the same effect as friction: neither of them is
+    certain, but one or the other is.
+    """
+    anywhere = _inclusion(assessed, lambda one: one.laws["instrument"])
+    instead = _inclusion(assessed, lambda one: one.instead(part))
+    both = _inclusion(assessed, lambda one: one.laws["instrument"] if law in one.laws[part] else ())
+    alternatives = {
+        kind
+        for kind, p in instead.items()
+        if p >= 0.02 and anywhere[kind] < priors.NAMED and both.get(kind, 0.0) < 0.5 * p
+    }
+    laws = ({*one.laws[part], *(alternatives & {*one.instead(part)})} for one in assessed)
+    return [
+        one._replace(laws={**one.laws, part: tuple(sorted(some))})
+        for one, some in zip(assessed, laws, strict=True)
+    ]
 
 
 def _explained(

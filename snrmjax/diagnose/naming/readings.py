@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from snrmjax.diagnose import priors
 from snrmjax.identify.test_model.balance import Balance, whitening
@@ -83,6 +83,8 @@ class Readings(NamedTuple):
     beyond: Complex[np.ndarray, " state"]  # Z less that of the model, 1/s²
     rows: Float[np.ndarray, " row"]  # Z less that of the model, whitened
     errors: Float[np.ndarray, "row error"]  # by 1σ of modal mass, linear test, levels
+    levels: Int[np.ndarray, "kind level"]  # indices of the level errors in `errors`
+    level_std: Float[np.ndarray, " kind"]  # their 1σ, of `LEVEL_ERRORS`
     posterior: TestPosterior
     harmonics: tuple[HarmonicReading, ...] = ()
 
@@ -179,6 +181,7 @@ def readings_of(
     columns.append(2j * omega * natural * linear.damping_std)
     level_stds = np.hypot(posterior.hyper.level_std, [priors.FLOOR, priors.FLOOR, 0.0, 0.0])
     columns += [one - known for one in shifted]
+    of_level = len(columns) + np.arange(4 * states.n_levels).reshape(4, -1)
     for kind, (column, level_std) in enumerate(zip(of_levels, level_stds, strict=True)):
         if kind < 2:  # gain and phase: restore the corrections of the records
             rows = rows + column * posterior.level_errors[states.level, kind]
@@ -190,6 +193,7 @@ def readings_of(
     none, slope = np.empty(0), now.slope
     bare = Readings(
         *(linear, now.velocity, omega, now.force, order, now.z, slope, root, rows, none, none),
+        *(of_level, level_stds),
         posterior=posterior,
     )
     higher = () if recorded is None else _higher(linear, states, now.velocity, motion, recorded)

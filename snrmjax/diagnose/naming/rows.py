@@ -6,7 +6,7 @@ The blocks share only the laws. Each is orthogonalised once (QR) for all hypothe
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from scipy.linalg import block_diag, solve_triangular
 
 from snrmjax.diagnose import priors
@@ -21,6 +21,9 @@ CURVES = "stiffness", "damping"
 """Parts that are curves of amplitude; the others are harmonics."""
 
 RemainderStds = tuple[float, ...]
+LevelStds = tuple[float, float, float, float]
+"""1σ of level errors of gain, phase, stiffness and damping, over those estimated without laws."""
+WITHOUT_LAWS: LevelStds = (1.0, 1.0, 1.0, 1.0)
 
 
 class Cell(NamedTuple):
@@ -29,6 +32,7 @@ class Cell(NamedTuple):
     log_evidence: float  # ln of evidence times prior
     columns: tuple[int, ...]  # indices in `Problem.columns`
     remainder_std: RemainderStds  # of stiffness, damping and every other harmonic
+    level_std: LevelStds = WITHOUT_LAWS
 
 
 class RowBlock(NamedTuple):
@@ -37,6 +41,7 @@ class RowBlock(NamedTuple):
     rows: Float[np.ndarray, " row"]
     design: Float[np.ndarray, "row unknown"]  # errors, then remainder functions of unit variance
     groups: tuple[int, ...]  # numbers of errors, and of functions of every remainder
+    levels: Int[np.ndarray, "kind level"]  # indices of the level errors
     directions: Float[np.ndarray, "row direction"]  # Q of the design
     triangle: Float[np.ndarray, "direction unknown"]
     laws: Float[np.ndarray, "row column"]
@@ -49,12 +54,14 @@ class RowBlock(NamedTuple):
         rows: Float[np.ndarray, " row"],
         errors: Float[np.ndarray, "row error"],
         *remainders: Float[np.ndarray, "row function"],
+        levels: Int[np.ndarray, "kind level"] | None = None,
     ) -> "RowBlock":
         """A block without laws."""
+        of_level = np.zeros((4, 0), int) if levels is None else levels
         design = np.hstack([errors, *remainders])
         groups = errors.shape[1], *(one.shape[1] for one in remainders)
         none = np.empty((0, 0))
-        return cls(rows, design, groups, *np.linalg.qr(design), none, none, none)
+        return cls(rows, design, groups, of_level, *np.linalg.qr(design), none, none, none)
 
     def with_laws(self, laws: Float[np.ndarray, "row column"]) -> "RowBlock":
         """The block with the columns of laws."""
@@ -63,9 +70,13 @@ class RowBlock(NamedTuple):
         left = both - self.directions @ along
         return self._replace(laws=laws, along=along, across=left.T @ left)
 
-    def variances(self, remainder_std: RemainderStds) -> Float[np.ndarray, " unknown"]:
+    def variances(
+        self, remainder_std: RemainderStds, level_std: LevelStds = WITHOUT_LAWS
+    ) -> Float[np.ndarray, " unknown"]:
         """Prior variances of the design's unknowns."""
-        return np.repeat([1.0, *(std**2 for std in remainder_std)], self.groups)
+        values = np.repeat([1.0, *(std**2 for std in remainder_std)], self.groups)
+        values[self.levels] = np.square(level_std)[:, None]
+        return values
 
 
 class Problem(NamedTuple):
@@ -76,6 +87,7 @@ class Problem(NamedTuple):
     functions: dict[str, Float[np.ndarray, "state function"]]  # of remainders of unit variance
     blocks: tuple[RowBlock, ...]  # fundamentals, then every other harmonic
     length: float  # correlation length in ln a of the remainders of stiffness and damping
+    level_stds: tuple[tuple[LevelStds, float], ...] = ((WITHOUT_LAWS, 0.0),)  # with ln prior
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -106,7 +118,8 @@ def problem_of(readings: Readings, columns: list[Column], length: float) -> Prob
     curves = natural**2 * functions[CURVES[0]].T
     lossy = 1j * readings.relative_frequency * curves
     remainders = readings.whitened(curves).T, readings.whitened(lossy).T
-    blocks = [RowBlock.of(readings.rows, readings.errors, *remainders)]
+    errors = readings.errors
+    blocks = [RowBlock.of(readings.rows, errors, *remainders, levels=readings.levels)]
     for one in readings.harmonics:
         both = _of_harmonic(x, x, length)
         functions[f"harmonic_{one.order}"] = both
@@ -175,7 +188,7 @@ def solved(problem: Problem, cell: Cell) -> Solved:
             if index == 0
             else cell.remainder_std[first + index - 1 :][:1]
         )
-        variances.append(block.variances(stds))
+        variances.append(block.variances(stds, cell.level_std))
         kept.append(np.repeat([False, True], [block.groups[0], sum(block.groups[1:])]))
     root, remain = np.sqrt(np.concatenate(variances)), np.concatenate(kept)
     q, r = np.linalg.qr(np.vstack([design * root, np.eye(len(root))]))

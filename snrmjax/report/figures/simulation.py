@@ -183,8 +183,9 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
 
     The velocity is shown as amplitude of the fundamental and as peak of the whole signal: they
     differ where an internal resonance puts energy into higher harmonics. Unstable motions are
-    dashed; markers name internal resonances where the other mode has most of the energy. Of several modes a
-    panel shows their fractions of it, of several sensors their fundamentals over the first's.
+    dashed; markers name internal resonances where the other mode has most of the energy. Several
+    modes have a panel of their energy fractions, several sensors one of their fundamentals over
+    the first.
     The energy axes show the last five decades.
 
     Arguments: `sensor` by default the branch's first.

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from truths.phased_states import OMEGA, linear_motion, named, nothing, readings, states_of
+from truths.phased_states import OMEGA, RATIO, linear_motion, named, nothing, readings, states_of
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming import hypotheses, parts
@@ -121,6 +121,23 @@ def test_pairs_left_out_are_irrelevant():
         "cubic_stiffness",
         "quadratic_damping",
     }
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_friction_is_found_where_errors_of_levels_are_unknown(seed):
+    """Six states a level at resonance: friction is steep, and half taken for levels' errors.
+
+    At resonance an offset of the force does the same: one or the other.
+    """
+    test = {"phases": (-4.0, -2.5, -1, 1, 2.5, 4), "level_std": (0.0,) * 4, "noise": 1e-2}
+    friction = (lambda x: 0.1 * x**2), (lambda x, om: 2 * RATIO * 0.01 / (x * om))
+    _, found = named(*friction, levels=6, seed=seed, **test)
+    assert found.answers.get(("cubic_stiffness",), 0.0) < 0.02
+    damping = next(one for one in found.parts if one.part == "damping")
+    assert damping.verdict in ("named", "ambiguous")
+    (group,) = damping.candidates
+    assert "coulomb_friction" in group
+    assert {*group} <= {"coulomb_friction", "force_offset_error"}
 
 
 def test_readings_do_not_change_with_units_of_force():
