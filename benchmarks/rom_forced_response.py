@@ -94,7 +94,9 @@ def full_model(beam: sj.condense.Beam, kind: str) -> FullModel:
     ratio = _RATIO * (first / frequency if kind == "mass" else frequency / first)
     weighted = mass @ shapes
     damping = weighted * (2 * ratio * frequency) @ weighted.T
-    load, middle = (np.asarray(row)[free] for row in (uniform_load(beam), interpolation(beam, 0.5)[1]))
+    load, middle = (
+        np.asarray(row)[free] for row in (uniform_load(beam), interpolation(beam, 0.5)[1])
+    )
     return FullModel(beam, damping, frequency, ratio, load, middle)
 
 

@@ -12,17 +12,17 @@
 # %% [markdown]
 # # A backbone from states near resonance
 #
-# A nonlinear structure has a natural frequency that moves with amplitude: its *backbone*. The
-# classical way to measure it is to tune every state to phase resonance, which is exactly where a
-# test tends to fall off the branch. Kwarta and Allen's inverse method does without: **one** steady
+# A nonlinear structure has a natural frequency that changes with amplitude: its *backbone*. The
+# classical way to measure it is to tune every state to phase resonance, exactly where a
+# test tends to jump off the branch. Kwarta and Allen's inverse method avoids this: **one** steady
 # state near resonance, with its phase, gives one point of the backbone and one of the damping. With
 # the velocity's phasor $V$ at the force's frequency $\Omega$, and the mode shape $\phi$ where force
-# and sensor are, natural frequency and damping are read off the complex balance
+# and sensor are, natural frequency and damping follow from the complex balance
 #
 # $$\tilde\omega^2 - \Omega^2 + 2i\tilde\zeta\tilde\omega\Omega = i\Omega\,\phi^2 F / V .$$
 #
-# This notebook follows their argument on the two numerical beams of the paper, says where a point
-# belongs on the backbone, and answers the question that their Appendix B leaves open: why does the
+# This notebook follows their argument on the two numerical beams of the paper, shows where a point
+# lies on the backbone, and answers the question that their Appendix B leaves open: why does the
 # damping of the curved beam, which is linear by construction, seem to rise to 47 1/s?
 #
 # Conventions: phase is that of the velocity relative to the force, 0° at resonance (the paper's
@@ -40,7 +40,7 @@ HERTZ = 2 * np.pi
 
 
 # %% [markdown]
-# ## The flat beam stiffens
+# ## The flat beam hardens
 #
 # Four modes, 55 coefficients of one quartic potential. Its nonlinear normal mode, computed by
 # harmonic balance with nine harmonics, is the reference. Between 87.5 and 90.2 Hz it leaves the
@@ -48,7 +48,7 @@ HERTZ = 2 * np.pi
 # mode cannot show that, and the errors below are those outside it.
 
 # %%
-# Frequency and energy, and velocity, of the undamped mode of the flat beam: it stiffens, and
+# Frequency and energy, and velocity, of the undamped mode of the flat beam: it hardens, and
 # leaves the backbone on a tongue between 87.5 and 90.2 Hz.
 flat = sj.model.flat_beam()
 flat_mode = sj.nonlinear_normal_mode(flat, 105 * HERTZ)
@@ -78,7 +78,7 @@ found.plot(truth=flat_mode, modes=flat.modes)
 # %% [markdown]
 # ### Where a point lies on the backbone
 #
-# The paper draws ω̃ at the velocity that was measured. But ω̃ of a nonlinear *stiffness* belongs to
+# The paper plots ω̃ at the measured velocity. But ω̃ of a nonlinear *stiffness* belongs to
 # the displacement amplitude v/Ω, so a state measured at Ω ≠ ω̃ lies on the backbone at the velocity
 # v·ω̃/Ω. The difference is large for states this far from resonance.
 
@@ -108,7 +108,7 @@ print(f"velocity:     median {np.median(by_velocity):.4f} %, worst {by_velocity.
 # %% [markdown]
 # ### Responses that were not measured
 #
-# From these states alone: the resonance and the whole response at the paper's four forces, with
+# From these states alone: the resonance and the complete response at the paper's four forces, with
 # the unstable part, and the same by harmonic balance for comparison.
 
 # %%
@@ -146,11 +146,11 @@ for resonance, exact in zip(resonances, flat_responses, strict=True):
     )
 
 # %% [markdown]
-# ## The curved beam softens, then stiffens
+# ## The curved beam softens, then hardens
 #
 # Tab. 4 as printed is bistable, which cannot give the curve that the paper shows. With three times
-# the cubic coefficient the beam is monostable and does what the text says. Both readings are
-# shipped; the model is asked for its equilibria.
+# the cubic coefficient the beam is monostable and behaves as the text describes. Both
+# interpretations are included; the equilibria of the model show the difference.
 
 # %%
 curved = sj.model.curved_beam()
@@ -166,7 +166,7 @@ for model in (curved, printed):
 
 # %%
 # Natural frequency and damping of the curved beam against amplitude: frequency falls from 65 Hz,
-# turns near 28 Hz and rises.
+# has a minimum near 28 Hz and rises.
 WINDOWS = [  # forces in N, degrees off resonance
     (np.linspace(5e-6, 1.8e-4, 12), (3, 28)),
     (np.linspace(1.85e-4, 2.2e-4, 24), (0.1, 3)),
@@ -223,16 +223,16 @@ plot.response_figure(
 #
 # The damping of both beams is linear: 2ζω₀ = 40.7 1/s for the curved one. Appendix B finds that
 # the identified 2ζ̃ω̃ falls a little where the beam softens and rises to about 47 1/s where it
-# stiffens, and suspects the harmonics. They are the cause, in two ways.
+# hardens, and suspects the harmonics. They are the cause, in two ways.
 #
 # *Energy.* At resonance the power of the force equals that of the damping, ½FV₁ = c⟨q̇²⟩. With the
-# fundamental as the amplitude, 2ζ̃ω̃ = F/V₁ = c·2⟨q̇²⟩/V₁²: larger than c by the harmonics' share
-# of the kinetic energy.
+# fundamental as the amplitude, 2ζ̃ω̃ = F/V₁ = c·2⟨q̇²⟩/V₁²: larger than c by the fraction of
+# the kinetic energy in harmonics.
 #
-# *The measure of amplitude.* If the **peak** of the velocity signal is taken instead, 2ζ̃ω̃ changes
+# *The measure of amplitude.* If the **peak** of the velocity signal is used instead, 2ζ̃ω̃ changes
 # by the factor V₁/v_peak as well.
 #
-# Far into stiffening only the cubic spring matters, and its free motion is the elliptic cosine
+# Far into hardening only the cubic spring matters, and its free motion is the elliptic cosine
 # with modulus k² = ½. Its numbers give both limits in closed form.
 
 # %%
@@ -254,7 +254,7 @@ print(
 
 # %%
 # Modal damping against amplitude by fundamental and by peak: the fundamental stays near the
-# linear value, the peak falls below it in softening and rises to 47 per second in stiffening.
+# linear value, the peak falls below it in softening and rises to 47 per second in hardening.
 with_peak = sj.identify.identify_points(curved_data, curved.modes, measure="peak")
 plot.modal_damping_figure(
     [
@@ -266,13 +266,13 @@ plot.modal_damping_figure(
 
 # %% [markdown]
 # With the peak, damping falls below the linear value in softening and tends to 47 to 48 1/s in
-# stiffening: the paper's curve. Both have the sharp spike at the lowest frequency, where the second
+# hardening: the paper's curve. Both have the sharp spike at the lowest frequency, where the second
 # harmonic is as large as the fundamental.
 #
-# And the bistable reading? In its first well it only softens. Its large orbits go through both
+# And the bistable interpretation? In its first well it only softens. Its large orbits pass through both
 # wells, where again only the cubic spring matters. To reach them, large states of the monostable
-# beam are followed while the cubic coefficient falls to the printed one and the force rises so
-# that the amplitude can keep up.
+# beam are followed while the cubic coefficient falls to the printed one and the force rises to
+# maintain the amplitude.
 
 # %%
 (large,) = sj.forced_response(curved, [8e-3], 40 * HERTZ, 400 * HERTZ)

@@ -13,19 +13,19 @@
 # # Forced responses: folds, backbones, isolated loops, and what they depend on
 #
 # The response of a nonlinear structure to a sine force has folds where a sweep jumps, motions that
-# no sweep from rest reaches, and a tip that several backbones claim to pass through. This notebook
+# no sweep from rest reaches, and a tip through which several backbones should pass. This notebook
 # computes them for the two numerical beams of Kwarta and Allen, by harmonic balance:
 #
-# 1. whole responses with their unstable parts, folds and bifurcations;
+# 1. complete responses with their unstable parts, folds and bifurcations;
 # 2. backbones: three definitions, and which of them passes through the resonances;
-# 3. motions apart from the main curve: another well, a closed loop;
+# 3. motions off the main curve: another well, a closed loop;
 # 4. how many harmonics are needed, and whether the estimated error is right;
 # 5. what the peak and the jump depend on, by exact derivatives.
 #
 # Conventions: frequencies in rad/s in the code and in Hz in print and figures; amplitudes are those
 # of the velocity's fundamental harmonic at midspan. The first call of a kind takes seconds, in
 # which its program is compiled; the same call with other numbers takes a fraction of one. With
-# `JAX_COMPILATION_CACHE_DIR` set to a folder, programs are kept for the next time.
+# `JAX_COMPILATION_CACHE_DIR` set to a folder, programs are kept for the next run.
 
 # %%
 # %matplotlib inline
@@ -65,10 +65,10 @@ def draw(axes, curve, colour, name, events=tuple(EVENTS)):
 
 
 # %% [markdown]
-# ## 1. Whole responses
+# ## 1. Complete responses
 #
-# The flat beam (four modes) stiffens: from the third force on its peak leans over, and two folds
-# bound a range with three motions. The curved beam (one mode) softens, then stiffens: at the lowest
+# The flat beam (four modes) hardens: from the third force on its peak leans over, and two folds
+# bound a range with three motions. The curved beam (one mode) softens, then hardens: at the lowest
 # force it leans to the left, at the others to the right, with superharmonic resonances below.
 # `forced_response` follows each curve around its folds and locates folds, peaks, phase resonances
 # and bifurcations on the way.
@@ -107,24 +107,24 @@ figure
 
 # %% [markdown]
 # Between the folds the middle motion is unstable, as in textbooks. The curved beam adds
-# *period doublings* (a Floquet multiplier through −1): the motion that repeats every cycle gives
-# way to one that repeats every second cycle, with half-order lines in the spectrum. At the largest
+# *period doublings* (a Floquet multiplier through −1): the motion that repeats every cycle is
+# replaced by one that repeats every second cycle, with half-order lines in the spectrum. At the largest
 # force a sweep downwards meets one at 139 Hz, long before the fold at 55 Hz.
 #
-# ## 2. What the tip of the curve is
+# ## 2. The tip of the curve
 #
-# Three curves claim to be the backbone.
+# Three curves are called the backbone.
 #
 # * **Undamped mode**: free periodic motions without damping, followed through every internal
-#   resonance. Where five times its frequency meets the model's second mode, the curve runs out on
-#   a *tongue*: nearly all energy goes into the other mode and back. `tongues="skip"` leaves it out.
+#   resonance. Where five times its frequency meets the model's second mode, the curve follows
+#   a *tongue*: nearly all energy moves to the other mode and back. `tongues="skip"` omits it.
 # * **Damped mode**: the damped structure, kept in motion by an artificial negative damping
 #   proportional to mass (Krack's extended periodic motions). It gives a damping ratio as well.
 # * **Force-appropriated backbone**: the real structure under a real force that a controller keeps
 #   in phase with the velocity, as a phase-locked loop does.
 #
-# A controller may also hold the velocity amplitude: the force that this takes, against frequency,
-# has no folds here, and every state of the open loop is on it, the unstable ones too.
+# A controller may also keep the velocity amplitude: the required force against frequency has no
+# folds here, and contains every state of the open loop, the unstable ones too.
 
 # %%
 mode = sj.nonlinear_normal_mode(flat, 105 * HERTZ)
@@ -149,9 +149,9 @@ print(
 )
 
 # %% [markdown]
-# Which of them passes through the phase resonances of the responses? Each is read at the velocity
-# of the resonance. The last point of the phase-locked curve has the largest force exactly, so that
-# there nothing needs to be interpolated.
+# Which of them passes through the phase resonances of the responses? Each is evaluated at the velocity
+# of the resonance. The last point of the phase-locked curve has exactly the largest force, so
+# nothing is interpolated there.
 
 # %%
 tips = [(c, c.at_events("phase_resonance")[-1]) for c in flat_responses]
@@ -173,7 +173,7 @@ print(f"last point of the phase-locked curve against the phase resonance: {lock_
 
 # %% tags=["hide-input"]
 # (a) responses and three backbones of the flat beam, equal but for the tongue; (b) their fifth
-# harmonic; (c) frequency against energy, with and without the tongue; (d) the force that holds a
+# harmonic; (c) frequency against energy, with and without the tongue; (d) the force that keeps a
 # velocity, against frequency, without folds.
 figure, ((a, b), (c, d)) = drawing.panels(drawing.PAGE, 5.8, 2, 2)
 for curve, k in tips:
@@ -220,21 +220,21 @@ drawing.name_axes(d, "(d) force that holds a velocity", HZ, "Force (mN)")
 figure
 
 # %% [markdown]
-# Away from the tongue the three agree to about two millihertz. On it they part. The undamped mode
-# leaves the backbone altogether. The phase-locked curve, the only one that a test can see, stays on
+# Away from the tongue the three agree to about two millihertz. On it they differ. The undamped mode
+# leaves the backbone. The phase-locked curve, the only one that a test can measure, stays on
 # it, but its fifth harmonic peaks there, limited by the second mode's own damping of 0.09 %. The
-# damped mode hardly notices, and that is no physics: its artificial negative damping acts on every
-# mode alike and outweighs the second one's own tenfold.
+# damped mode is hardly affected, which is an artefact: its artificial negative damping acts on
+# every mode alike and exceeds that of the second mode tenfold.
 #
 # The damping *ratio* of the damped mode falls while the frequency rises: 2ζω stays that of the
 # linear damping, 49.65 1/s, whatever the stiffness does.
 #
-# ## 3. Motions apart from the main curve
+# ## 3. Motions off the main curve
 #
 # **Another well.** The curved beam as printed in the paper's table has two stable equilibria. Here
 # it is made from the other by replacing one part of the model: models, like all data in JAX, are
 # never changed in place, and `tree_at` returns a new one. A model of the same kind with other
-# numbers also needs no program compiled again.
+# numbers also needs no new compilation.
 
 # %%
 weakest = sj.model.CURVED_BEAM_FORCES[0]
@@ -258,7 +258,7 @@ for name, well, curve in (("first", wells[0], first_well), ("second", wells[1], 
 # given amplitude needs then rises, falls and rises again: three amplitudes share one force. The
 # lowest belongs to the main curve, the upper two to a closed loop above it, which no sweep from
 # rest enters. The phase-locked curve goes through all three; the search starts from it. (With
-# `known=[]` the search is given no curve and returns the main one too.)
+# `known=[]` the search has no known curve and returns the main one too.)
 #
 # Habib, Cirillo & Kerschen, Nonlinear Dyn. 93 (2018) 979, doi:10.1007/s11071-018-4240-z.
 
@@ -302,8 +302,8 @@ figure
 # %% [markdown]
 # ## 4. How many harmonics
 #
-# Every curve has an estimate of its own error: `truncation` is the share of the velocity in the
-# harmonics that were left out. The reference is the same motion, at the same force and frequency,
+# Every curve has an estimate of its own error: `truncation` is the fraction of the velocity in the
+# truncated harmonics. The reference is the same motion, at the same force and frequency,
 # solved again with 31 harmonics.
 
 
@@ -340,7 +340,7 @@ print(f"estimate over truth at nine of ten motions: {spread[0]:.2f} to {spread[1
 
 # %% [markdown]
 # Motions at given frequencies do not show which folds are missing with fewer harmonics: for that
-# the curve is followed again. For the flat beam the phase resonance is enough.
+# the curve is traced again. For the flat beam the phase resonance is enough.
 
 # %%
 (crude,) = sj.forced_response(
@@ -378,16 +378,16 @@ drawing.name_axes(b, "(b) distance from 31 harmonics", HZ, "Relative error of th
 figure
 
 # %% [markdown]
-# For the tip of the flat beam's curve one harmonic is good to 0.2 %, three to 0.001 %. The curved
+# For the tip of the flat beam's curve one harmonic is accurate to 0.2 %, three to 0.001 %. The curved
 # beam needs more: one harmonic makes the tip 3 % too high and misses the superharmonic resonance
-# that folds back at 40.7 Hz; with nine the error is still some 5 % at 20 Hz. The estimated
+# that folds back at 40.7 Hz; with nine the error is still about 5 % at 20 Hz. The estimated
 # error is right even there: for nine motions of ten it is within a tenth of the true one.
 #
 # ## 5. What the peak and the jump depend on
 #
 # Each of these results is a function of the model's numbers: 55 coefficients, four frequencies,
-# four damping ratios. JAX differentiates functions exactly, not by differences: `jacrev` makes of a
-# function another one that returns all its derivatives, here 126. What is differentiated is the
+# four damping ratios. JAX differentiates functions exactly, not by differences: `jacrev` turns a
+# function into one that returns all its derivatives, here 126. Differentiated is the
 # solution of "harmonic balance, and at a peak" (or "at a fold"), which `periodic_motion` finds by
 # Newton's method from a point of the curve; its derivative costs one more linear solve.
 
@@ -442,7 +442,7 @@ figure
 
 # %% [markdown]
 # The peak velocity depends on the first mode's damping alone, through 2ζω: no stiffness changes it
-# by more than a hundredth of its own change. Where the curve jumps is decided by the first mode's
+# by more than a hundredth of its own change. The jump depends on the first mode's
 # frequency, its damping, and *one* of the 55 coefficients. Three numbers of 63 are what a test must
 # get right.
 

@@ -17,7 +17,7 @@
 #
 # 1. 32 near-resonant states of eight force levels against 85 states along one response: what each
 #    test determines, and how well;
-# 2. what a band is made of, whether its width is right, and which state to measure next.
+# 2. the contributions to a band, whether its width is right, and which state to measure next.
 #
 # Notebook 11 does the same with a measured beam. The residual of a state is that of its force
 # balance, at the motion as it was measured,
@@ -25,11 +25,11 @@
 # $$\left(\tilde\omega^2 - \Omega^2 + 2i\tilde\zeta\tilde\omega\Omega\right) X / A - F ,$$
 #
 # with the displacement $X$, the modal constant $A$ and the force $F$. No response is computed, so
-# folds and unstable parts do no harm. Residuals are divided by their noise and made independent
+# folds and unstable parts do not matter. Residuals are divided by their noise and made independent
 # ("whitened"). Errors that all states of a level have in common are unknowns too.
 #
 # The first call of a kind compiles its program, which takes seconds. With
-# `JAX_COMPILATION_CACHE_DIR` set to a folder, programs are kept for the next time.
+# `JAX_COMPILATION_CACHE_DIR` set to a folder, programs are kept for the next run.
 
 # %%
 # %matplotlib inline
@@ -76,11 +76,11 @@ for name, fit in fits.items():
 
 # %% [markdown]
 # The truth is the damped normal mode. (The undamped one has a tongue between 87.5 and 90.2 Hz, see
-# notebook 01; with damping little of it is left.)
+# notebook 01; with damping little of it remains.)
 
 # %%
-# Natural frequency and damping against amplitude by both tests, on the true curves, with what
-# each measured state gives by itself; the band of the one response is wide.
+# Natural frequency and damping against amplitude from both tests, on the true curves, with the
+# results of single states; the band of the one response is wide.
 single = {
     name: sj.identify.identify_points(t.steady_states, flat.modes) for name, t in tests.items()
 }
@@ -123,7 +123,7 @@ for name, (values, bands) in rows.items():
     )
 
 # %% [markdown]
-# The curves are too close together to compare. Their differences from the truth show more.
+# The curves are too close to compare. Their differences from the truth show more.
 
 # %% tags=["hide-input"]
 # Fitted less true natural frequency and damping against amplitude, with 95 % bands: both curves
@@ -163,8 +163,8 @@ for exact in sj.forced_response(flat, [2.669e-3, 1.334e-2], *ends):
 # %% [markdown]
 # Both curves lie on the true one, that of the 85 states within 0.12 Hz. But the bands differ
 # tenfold. Eight levels show by how much levels differ; one level cannot, so that its band has to
-# allow for a reading that is wrong as a whole. More states along one response do not mend that.
-# Its resonances, too, are predicted well and known badly.
+# allow for an error common to the whole level. More states along one response do not help.
+# Its resonances, too, are predicted accurately but with wide bands.
 #
 # Random noise is not the only error. Let the gain of every level be known to 1 % only:
 
@@ -188,15 +188,15 @@ for name, fit in fits.items():
 
 # %% [markdown]
 # Eight levels have eight unknown gains, which widen the bands by a sixth and a tenth. Those of
-# the one response allow for more than that already.
+# the one response already allow for more than that.
 #
-# ## 2. What the band is made of, whether its width is right, and what to measure next
+# ## 2. Contributions to the band, whether its width is right, and what to measure next
 #
 # The width of a band follows from derivatives of the fit by every single measured number. Their
-# squares, times the variances, add up to the band's: the shares below.
+# squares, times the variances, add up to that of the band: the fractions below.
 
 # %%
-# Bars: the share of every kind of measured number in the variance of both curves.
+# Bars: the fraction of every kind of measured number in the variance of both curves.
 fractions = sj.identify.contributions(with_levels)
 for row in fractions.by_kind():
     print(
@@ -207,9 +207,9 @@ fractions.plot()
 
 # %% [markdown]
 # Are these widths right? Refits to states drawn with replacement within their levels (bootstrap)
-# know the noise of the states and how far the states determine their level, but not by how much
-# levels differ: their spread is smaller by that part. Below stands the 1σ of the curves at some of
-# their knots by both ways.
+# include the noise of the states and how far the states determine their level, but not how much
+# levels differ: their spread is smaller by that part. Below is the 1σ of the curves at some of
+# their knots by both methods.
 
 # %%
 drawn = np.nanstd(sj.identify.bootstrap(few, 100), axis=0)
@@ -221,7 +221,7 @@ for name in knots[3::4]:
     print(f"{name}: covariance {named[name][0]:.4g}, bootstrap {named[name][1]:.4g}")
 
 # %% [markdown]
-# And what to measure next? Every stable state of the fitted responses is a candidate. They are
+# What to measure next? Every stable state of the fitted responses is a candidate. They are
 # ranked by how much narrower they make the bands of both curves, each given the ones before it
 # (optimal design).
 

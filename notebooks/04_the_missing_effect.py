@@ -10,11 +10,11 @@
 # ---
 
 # %% [markdown]
-# # The missing effect: where model and data disagree, what is missing, and how to check it
+# # The missing effect: where model and data disagree, what is missing, and how to validate it
 #
 # A model from a linear test disagrees with measurements at larger amplitudes. `diagnose_model` (on
-# the command line `snrmjax diagnose`) says where, names the effect that is missing, adds it, and
-# checks the completed model on a level that was left out of the fit:
+# the command line `snrmjax diagnose`) locates the disagreement, names the missing effect, adds it,
+# and validates the completed model on a level withheld from the fit:
 #
 # 1. an effect that the model lacks, from the first disagreement to the completed model;
 # 2. two effects that the fundamental cannot distinguish, and the measurement that does.
@@ -91,8 +91,8 @@ headline["the level left out is predicted to within its noise"] = found.gap.inte
 
 # %% [markdown]
 # Every measured state, with the model as given and with the completed one: the misfit of the force
-# in units of its noise. Then the responses of both models over the measured states, and what each
-# effect would explain by itself.
+# in units of its noise. Then the responses of both models over the measured states, and how much
+# each effect would explain by itself.
 
 # %%
 # The misfit of every state in units of its noise, before and after the stop is added: from tens
@@ -138,10 +138,10 @@ headline["the completed model's peak within 0.1 Hz and 2 %"] = (
 )
 
 # %% [markdown]
-# ## 2. An ambiguous case, decided by the measurement that the diagnosis asks for
+# ## 2. An ambiguous case, decided by the measurement that the diagnosis requests
 #
 # The same states, but only their fundamentals were recorded. A stop on one side and a gap on both
-# sides change the fundamental alike. The diagnosis says so, and which measurement decides.
+# sides change the fundamental alike. The diagnosis reports this, and which measurement decides.
 
 # %%
 states = test.steady_states

@@ -15,7 +15,7 @@
 # Kwarta and Allen leave two questions about damping open. In their measurements the identified
 # damping "does not intersect" the linear one at low amplitude and is adjusted by hand (section
 # 4.2); and damping that is linear by construction seems to change with amplitude (Appendix B).
-# What does the diagnosis say?
+# What does the diagnosis show?
 #
 # 1. The first: their force is a straight line of the drive voltage, with an intercept. Could an
 #    error of this line be the cause? Can the diagnosis distinguish it from friction? Are the
@@ -131,8 +131,8 @@ headline["both beyond 95 % of their own error"] = all(c > half for c, half in in
 #
 # The flat beam's first mode with its own cubic stiffness, 79.02 Hz and 5 % of linear damping; six
 # levels over the paper's range of forces, frequency stepped up and down, by harmonic balance. The
-# same with friction in place of the error: Coulomb's force takes off as much as
-# a tenth of the lowest force does at resonance. Records of these motions differ in their
+# same with friction in place of the error: at resonance the Coulomb force balances
+# a tenth of the lowest force. Records of these motions differ in their
 # phases and in the error of the force; noise is 1 % in amplitude, 0.7° in phase and 0.3 % in force.
 
 # %%
@@ -203,7 +203,7 @@ def recorded(states, nearest, farthest, *, missing=0.0, seed=1, per_level=6, sid
 
 # %% [markdown]
 # The paper's flat beam was measured 18° to 34° off resonance (indicators 0.68 to 0.91). What its
-# method finds from such states when an intercept of 6, 10 and 15 % of the lowest force is left out
+# method gives for such states when an intercept of 6, 10 and 15 % of the lowest force is left out
 # of the force, and with the opposite error (lines: the prediction by 1/F):
 
 # %% tags=["hide-input"]
@@ -241,7 +241,7 @@ headline["damping at the lowest level errs by the share left out, within 2 %"] =
 # ### The diagnosis of states tuned to resonance, as in the paper, and farther off
 #
 # At resonance, within 4°, a force error and friction have the same effect: both are candidates, and
-# the diagnosis asks for states that separate them. These are farther off resonance, where a force
+# the diagnosis requests states that separate them. These are farther off resonance, where a force
 # error is in phase with the *force*, but friction with the *velocity*.
 
 # %%
@@ -333,24 +333,24 @@ headline["the test's states would find the offset to 2 % of the lowest force"] =
 # **Conclusion: the printed numbers do not decide it, and they contradict the simplest
 # explanation.**
 #
-# - *For*: leaving out an intercept of this size makes an error as large as the one seen, as 1/F and
+# - *For*: leaving out an intercept of this size makes an error as large as the observed one, as 1/F and
 #   therefore only at low amplitude.
 # - *Against the intercept left out*: the sign. It would raise the flat beam's damping; the paper
-#   sees a drop. For the curved beam no sign is printed.
+#   observes a drop. For the curved beam no sign is printed.
 # - *Against an error of the line*: its points were found with the linear damping, so that inside
 #   the range of the calibration the method returns the linear damping, to the width of the band
 #   in the first figure. The flat beam's lowest validated force lies inside. A drop there means that
 #   the force in the test was not that of the calibration at the same voltage, by up to the
-#   intercept: the drive behaved differently, or the line was used for voltages to which it did not
-#   belong.
-# - *On its size*: that response curves with and without the adjustment hardly differ, the lowest at
+#   intercept: the drive behaved differently, or the line was used outside its
+#   voltages.
+# - *On its magnitude*: that response curves with and without the adjustment hardly differ, the lowest at
 #   1.066 mN included, allows a few per cent there: about 50 µN for 5 %, a third of the intercept.
 #   The drop itself is drawn, not printed.
 # - The paper suspects a mode shape that changes with amplitude. Such a change vanishes at low
 #   amplitude by definition: it cannot change the damping there.
 #
 # What would decide: the test's own rows (voltage, frequency, velocity, phase) with the model of
-# the linear test. Some thirty states near resonance give the offset to about 2 % of the lowest
+# the linear test. About thirty states near resonance give the offset to about 2 % of the lowest
 # force; two states of the lowest level on either side of resonance distinguish it from friction.
 
 # %% [markdown]
@@ -358,7 +358,7 @@ headline["the test's states would find the offset to 2 % of the lowest force"] =
 #
 # Notebook 01 shows where the 47 1/s come from. Here peaks are read off an oscilloscope, and the
 # question is what the curved beam's model lacks. States by harmonic balance, for softening and
-# stiffening separately, 3° to 34° off resonance; the model has the true stiffness and the linear
+# hardening separately, 3° to 34° off resonance; the model has the true stiffness and the linear
 # damping.
 
 # %%
@@ -400,7 +400,7 @@ def read(states, quantity):
 
 
 # %% tags=["hide-input"]
-# Modal damping against velocity. Stiffening: a sixth above the linear value by peaks, near it by
+# Modal damping against velocity. Hardening: a sixth above the linear value by peaks, near it by
 # fundamentals. Softening: below it by peaks; by fundamentals near it, and a tenth above it next
 # to the lowest frequency.
 linear = float(2 * curved.modes.damping_ratio[0] * curved.modes.natural_frequency[0])
@@ -458,16 +458,16 @@ headline["both: held-out and top level predicted to within their noise"] = all(
 soft.plot()
 
 # %% [markdown]
-# No damping law is identified. The true stiffness does not fit amplitudes that were misread, which
-# reveals the error: in softening the reading is wrong by a factor 1 + sQ², as with a mode shape
-# that changes with amplitude; far into stiffening by a gain of −12 %, which the cubic spring
-# reveals. (Not for every draw of the noise: of six in stiffening, four give the gain alone, one
+# No damping law is identified. The true stiffness does not fit misread amplitudes, which
+# reveals the error: in softening the amplitude is wrong by a factor 1 + sQ², as with a mode shape
+# that changes with amplitude; far into hardening by a gain of −12 %, which the cubic spring
+# reveals. (Not for every draw of the noise: of six in hardening, four give the gain alone, one
 # adds two further effects, one takes an added mass instead and answers `unknown`.) Where the
-# stiffness is free to follow the readings, as in an identification of backbone and damping without
+# stiffness is free to follow the amplitudes, as in an identification of backbone and damping without
 # a model, a damping law is nearly as good:
 
 # %%
-# Bars: what each effect explains by itself; a damping law is nearly as good as the best.
+# Bars: how much each effect explains by itself; a damping law is nearly as good as the best.
 square, cube = (float(value) for value in curved.potential.coefficient)
 free_std = {"111": 0.3 * abs(square), "1111": 0.3 * abs(cube)}
 free = stated(
@@ -489,8 +489,8 @@ headline["it is damping that falls with amplitude"] = min(law.parameters.values(
 # %% [markdown]
 # **What to learn.** A misread amplitude looks like a damping law of its own: here one that
 # falls with the square of the amplitude in softening and rises to 1.1653 of the linear 40.70 1/s in
-# stiffening. With the fundamental there is nothing to find: what it lies above 40.70 1/s (1.0184 in
-# the limit of stiffening, a tenth next to the lowest frequency) is energy that harmonics really
+# hardening. With the fundamental nothing is missing: its excess over 40.70 1/s (1.0184 in
+# the limit of hardening, a tenth next to the lowest frequency) is energy that harmonics really
 # dissipate, which the model includes. Two signs reveal a misread amplitude: the stiffness disagrees
 # over the same amplitudes, which no damping law does, and peak and fundamental of the recorded
 # signal differ. Use fundamentals; do not compute damping from peaks.

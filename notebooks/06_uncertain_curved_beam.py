@@ -14,14 +14,14 @@
 #
 # A batch of clamped curved beams is made to one drawing. Thickness and rise have tolerances, and
 # damping is known to ten per cent. How far do the responses of the batch scatter, which tolerance
-# makes them do so, and may one compute that from derivatives at the nominal beam?
+# causes it, and can it be computed from derivatives at the nominal beam?
 #
-# 1. The beam from its dimensions: what the drawing says becomes modes and a potential.
-# 2. A study of 4 000 beams on all cores, as one data set that survives being interrupted.
-# 3. Bands of the response, and what each tolerance does by itself.
-# 4. Sobol' indices: what each tolerance does alone, and together with others.
+# 1. The beam from its dimensions: the drawing becomes modes and a potential.
+# 2. A study of 4 000 beams on all cores, as one data set, which can be interrupted and continued.
+# 3. Bands of the response, and the effect of each tolerance by itself.
+# 4. Sobol' indices: the effect of each tolerance alone, and together with others.
 # 5. First and second order against the members: the scatter from which linearisation fails, and
-#    what no derivative at the nominal beam knows of.
+#    what derivatives at the nominal beam do not show.
 #
 # Conventions: frequencies in rad/s in the code and in Hz in print and figures; amplitudes are those
 # of the velocity's fundamental harmonic at midspan; "scatter" is one standard deviation.
@@ -57,7 +57,7 @@ headline = {}
 #
 # The curved beam of Kwarta and Allen: 304.8 mm long, 12.7 mm wide, 0.508 mm thick, of steel, a
 # radius of 11.43 m. The rise at midspan is twice the thickness. Finite elements are condensed to
-# two modes, as `snrmjax rom` does it; `read_beam_models` does it for any dimensions. The damping
+# two modes, as by `snrmjax rom`; `read_beam_models` does this for any dimensions. The damping
 # ratio is 2 % here; the force is distributed uniformly.
 
 # %%
@@ -153,8 +153,8 @@ headline["0.1 mm less rise moves the peak past the internal resonance, by more t
 # ## 2. The study
 #
 # Thickness scatters by 1 %, rise by 5 % (51 µm), damping by 10 %. Members are drawn by a Latin
-# hypercube. `model_of` says what beam belongs to the numbers of a member; of every response are
-# kept the peak, the folds, and the highest and lowest velocity at 241 frequencies.
+# hypercube. `model_of` makes the beam of a member from its parameters; of every response the
+# study keeps the peak, the folds, and the highest and lowest velocity at 241 frequencies.
 
 # %%
 study = sj.study.Study(
@@ -189,11 +189,11 @@ headline["one beam in twenty to one in five peaks past the internal resonance"] 
 headline["every member has its whole response"] = bool(np.all(ended))
 
 # %% [markdown]
-# ## 3. Bands, and what each tolerance does
+# ## 3. Bands, and the effect of each tolerance
 #
 # Between the folds a response has two stable motions at one frequency. The bands are therefore of
-# the highest motion and of the lowest; where they part, it depends on the way there which of the
-# two a test meets.
+# the highest motion and of the lowest; where they differ, the history of the test decides which of the
+# two it meets.
 
 # %% tags=["hide-input"]
 # Bands of the highest and of the lowest motion against frequency: 95 % and half of all beams, and
@@ -220,8 +220,8 @@ drawing.legend(figure)
 figure
 
 # %% [markdown]
-# What one quantity does by itself: the mean over the others (line, with its 95 % band) among some
-# of the members, and the share of the variance that it explains. Over the rise the peak is not a
+# The effect of one quantity by itself: the mean over the others (line, with its 95 % band) among some
+# of the members, and the fraction of the variance that it explains. Over the rise the peak is not a
 # curve but a step, at about 0.95 mm, which the mean (a spline) rounds off.
 
 # %% tags=["hide-input"]
@@ -255,8 +255,8 @@ print({f"{text}, {name}": f"{fraction:.3f}" for (text, name), fraction in fracti
 # %% [markdown]
 # ## 4. Sobol' indices
 #
-# The first-order index is the share of variance by one input alone, the total index has what it
-# does together with others. Both come from the members of Saltelli's scheme, another study:
+# The first-order index is the fraction of variance due to one input alone, the total index
+# includes interactions with others. Both come from the members of Saltelli's scheme, another study:
 
 # %%
 # Bars: first-order and total indices of thickness, rise and damping for every output.
@@ -271,8 +271,8 @@ print(indices)
 plot.sensitivity_figure(indices)
 
 # %% [markdown]
-# The rise decides: by it the beam is stiff, and by it the stiffness falls with amplitude. Thickness
-# and damping hardly matter to the frequencies.
+# The rise dominates: it makes the beam stiff, and makes the stiffness fall with amplitude. Thickness
+# and damping hardly affect the frequencies.
 #
 # ## 5. Where linearisation fails
 #
@@ -293,23 +293,23 @@ propagated.plot()
 
 # %% [markdown]
 # From which scatter on is first order off by 10 % (of its standard deviation or of its 95 % range)?
-# The curvature at the nominal beam tells, as a factor on all tolerances together:
+# The curvature at the nominal beam gives the answer, as a factor on all tolerances together:
 
 # %%
 limit = dict(zip(quantities.names, propagated.scatter_limit.min(axis=0).tolist(), strict=True))
 print({name: f"{value:.3g}" for name, value in limit.items()})
 
 # %% [markdown]
-# The answer differs by what is asked. The fold at which a rising sweep jumps lies low, where the
-# beam is nearly linear: there first order serves at every scatter here. Peak and lower fold lie at
+# The answer depends on the quantity. The fold at which a rising sweep jumps lies low, where the
+# beam is nearly linear: there first order is accurate at every scatter here. Peak and lower fold lie at
 # the internal resonance: there first order fails at a fraction of the stated tolerances.
 #
-# And neither knows of the beams that get past the internal resonance. Against the *highest* peak of
+# And neither includes the beams that get past the internal resonance. Against the *highest* peak of
 # all members of the study:
 
 # %% tags=["hide-input"]
 # Histogram of the peak frequency: a large hump at 55 Hz, on which the bell of first order lies,
-# and a small one at 43 Hz, of which it knows nothing.
+# and a small one at 43 Hz, which it does not show.
 at = list(quantities.names).index("peak_frequency_hz")
 nominal_peak, by_first = quantities.value[at], propagated.statistics[0, 1, at]
 figure, panels = drawing.panels(drawing.COLUMN, 3.2, 1, 1)

@@ -10,19 +10,19 @@
 # ---
 
 # %% [markdown]
-# # The paper's two beams, made anew from finite elements
+# # The paper's two beams, recomputed from finite elements
 #
 # Kwarta and Allen test their method on reduced models of two clamped beams: a flat one with four
 # modes (Tabs. 1, 2 and A.1) and a curved one with one mode (Tabs. 3 and 4). Both were condensed
-# from finite elements, and what is printed of them is a table of polynomial coefficients. Are these
-# the coefficients of the beams whose dimensions are printed beside them?
+# from finite elements, and the paper prints tables of polynomial coefficients. Are these
+# the coefficients of the beams whose dimensions are printed with them?
 #
 # 1. The flat beam: linear modes, static load cases, one potential fitted to them.
 # 2. Every printed coefficient against the new one.
 # 3. The curved beam: coefficients at small loads, and the path to its limit point.
 # 4. The same by CalculiX, where it is installed.
-# 5. A beam whose dimensions are not known: the band of its backbone, and what a measured backbone
-#    tells about them.
+# 5. A beam with uncertain dimensions: the band of its backbone, and what a measured backbone
+#    determines about them.
 #
 # Implicit condensation loads the nonlinear finite elements with combinations of mode shapes, F =
 # M Φ f, reads the modal displacements q and fits ω²q + ∂V/∂q = f by one potential V. Conventions:
@@ -49,7 +49,7 @@ headline = {}
 # %% [markdown]
 # ## 1. The flat beam
 #
-# Forty elements, as the paper has. The frequencies come out within 0.6 % of the print, which were
+# Forty elements, as in the paper. The frequencies come out within 0.6 % of the print, which were
 # computed with another beam element.
 
 # %%
@@ -64,8 +64,8 @@ headline["linear frequencies are the printed ones within 0.7 %"] = bool(worst < 
 
 # %% [markdown]
 # Load cases of single modes, pairs and triples with all signs, each moving the beam by a quarter of
-# its thickness. One potential serves all four equations, so that its coefficients cannot contradict
-# one another.
+# its thickness. One potential serves all four equations, so that its coefficients are
+# consistent.
 
 # %%
 loads = fe.modal_loads(basis, 0.25 * 0.787e-3)
@@ -75,8 +75,8 @@ print(condensed)
 # %% [markdown]
 # ## 2. Every printed coefficient
 #
-# The sign of a mode is arbitrary: it is turned to that of the printed midspan shape. The flat beam
-# is symmetric, so that its quadratic coefficients are zero; those printed are small leftovers of a
+# The sign of a mode is arbitrary: it is set to that of the printed midspan shape. The flat beam
+# is symmetric, so that its quadratic coefficients are zero; those printed are small residuals of a
 # fit. All quartic coefficients of the potential:
 
 # %%
@@ -110,8 +110,8 @@ figure
 
 # %% [markdown]
 # They lie on one line, three times the print, but for one (1134, small, of the wrong sign). So the
-# table holds the right polynomial of this beam with its cubic forces divided by about three. The
-# closed form of the first mode alone (von Kármán, β = E·12.3026² / (2 ρ² A L⁵)) says the same.
+# table contains the right polynomial of this beam with its cubic forces divided by about three. The
+# closed form of the first mode alone (von Kármán, β = E·12.3026² / (2 ρ² A L⁵)) agrees.
 
 # %%
 closed = 204.8e9 * 12.3026**2 / (2 * 7870.0**2 * 0.0127 * 0.787e-3 * 0.2286**5)
@@ -126,7 +126,7 @@ headline["half of all 35 ratios lie between 2.7 and 3.1"] = bool(
 
 # %% [markdown]
 # For section 3.1 this is a change of scale: dividing every cubic term by three multiplies all
-# amplitudes by √3 at the same frequency. What the paper shows of its method does not depend on it.
+# amplitudes by √3 at the same frequency. The paper's results on its method do not depend on it.
 #
 # ## 3. The curved beam
 #
@@ -150,7 +150,7 @@ headline["curved beam: β is about twice the print"] = bool(1.9 < beta / BETA < 
 
 # %% [markdown]
 # Frequency and quadratic coefficient are those of the print; the cubic one is twice, not three
-# times. What does that mean for the text, which says that the beam softens and then stiffens? The
+# times. What does that mean for the text, in which the beam softens and then hardens? The
 # finite elements are loaded along mode 1, inwards and outwards, as far as they go.
 
 # %% tags=["hide-input"]
@@ -185,7 +185,7 @@ figure
 
 # %% [markdown]
 # The finite elements lose their stability at an inward load of about 0.38 and jump. All three
-# polynomials turn there, too. They differ in whether the force comes back through zero, that is
+# polynomials have a limit point there, too. They differ in whether the force comes back through zero, that is
 # whether the unloaded beam can rest in a second shape: a cubic force has a second equilibrium where
 # α² > 4 β ω².
 
@@ -205,14 +205,14 @@ headline["the finite elements lose stability below an inward load of 0.4"] = not
 # 0.8 rest at 3.39 and 3.69 thicknesses, and a force of degree nine through all its points has a
 # valley of 0.23 near two thicknesses, above zero. Three times the printed cubic term gives 0.63 at
 # 3.39 and 1.07 at 3.69 thicknesses, where the other two curves are far below zero. So it is the
-# reading nearest to the beam over the whole path: softening, then stiffening and at rest in one
-# place, as section 3.2 says. It is not the expansion of the force at small displacements; one mode
+# interpretation closest to the beam over the whole path: softening, then hardening, with one
+# equilibrium, as in section 3.2. It is not the expansion of the force at small displacements; one mode
 # with a cubic force cannot be both.
 #
 # ## 4. The same by CalculiX
 #
 # A deck of the flat beam with CalculiX's own beam elements, which are solids inside. Poisson's
-# ratio is zero, since our beams are free to narrow across their width.
+# ratio is zero, since the built-in beams are free to contract across their width.
 
 # %%
 COUNT = 40
@@ -250,12 +250,12 @@ else:
     headline["CalculiX has the same β within 1 %"] = bool(abs(there / first - 1) < 0.01)
 
 # %% [markdown]
-# All modes of both beams by beams and shells of CalculiX, beside every printed coefficient, come
+# All modes of both beams by beams and shells of CalculiX, with every printed coefficient, come
 # from `python benchmarks/paper_models.py --table table.md`. Over the print, median of the flat
 # beam's cubic coefficients of one or two modes: 2.93 by beams without Poisson's effect, 3.00 with
 # it, 2.99 by shells. Curved beam by 400 shell elements, the paper's own mesh: α 0.986, β 2.03.
 #
-# ## 5. Dimensions that are not known
+# ## 5. Uncertain dimensions
 #
 # A drawing says 0.787 mm, but sheet is rolled to ± 2 %, and no clamp is rigid. A beam file as a
 # function of its numbers: each call makes new elements, modes, load cases and coefficients, and all
@@ -300,8 +300,8 @@ before = np.quantile(members, [0.025, 0.975], axis=0)
 
 # %% [markdown]
 # Such a beam is measured: ten points of its backbone, each frequency to 0.03 %. Its thickness is
-# 0.775 mm and its spring 45 N m/rad, which the fit is not told. Thickness and spring both raise the
-# linear frequency; only the thickness lowers the hardening. So the backbone tells both.
+# 0.775 mm and its spring 45 N m/rad, unknown to the fit. Thickness and spring both raise the
+# linear frequency; only the thickness lowers the hardening. So the backbone determines both.
 
 # %%
 HIDDEN = {THICKNESS_OF: 0.775e-3, SPRING_OF: 45.0}

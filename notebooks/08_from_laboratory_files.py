@@ -10,7 +10,7 @@
 # ---
 
 # %% [markdown]
-# # From a laboratory's files to a backbone
+# # From laboratory files to a backbone
 #
 # A colleague leaves two files of a clamped arm on a shaker, and is on holiday:
 #
@@ -18,8 +18,8 @@
 # - `steps.mat`, stepped sines at three forces: "acceleration in g, phase in degrees".
 #
 # Nothing else is known. This is the way from there to a backbone: what is in the files, the map
-# that says which column is what, the check that finds what the map had wrong, linear modes, the
-# backbone, and at the end what no check can see.
+# that assigns the columns, the check that finds the error in the map, linear modes, the
+# backbone, and at the end what no check can detect.
 
 # %%
 # %matplotlib inline
@@ -54,12 +54,12 @@ def typed(line):
 # %% [markdown]
 # ## The laboratory
 #
-# So that the answer is known, the arm is a computed one: two modes, a spring of hardening stiffness
-# and some air at the tip, integrated in time by Runge and Kutta, without anything of this package.
-# The analyser is a line of FFT, the files are written by pyuff and by scipy, with everything that
-# such files have and nobody needs: a header, nodes, the lines of a drawing.
+# So that the answer is known, the arm is simulated: two modes, a spring of hardening stiffness
+# and some air at the tip, integrated in time by Runge-Kutta, independently of this package.
+# The analyser is one line of FFT, the files are written by pyuff and by scipy, with the usual
+# extras of such files: a header, nodes, the lines of a drawing.
 #
-# Its accelerometer shows 5 % too little. Nobody knows.
+# Its accelerometer reads 5 % low, which nobody knows.
 
 # %%
 REST, RATIO = HERTZ * np.array([42.0, 187.0]), np.array([0.008, 0.006])
@@ -96,7 +96,7 @@ def accelerations(force, step, samples, omega=1.0):
 
 
 # %%
-# Four hits of a soft hammer, some 5 N for 6 ms, recorded for three seconds at 2048 Hz.
+# Four hits of a soft hammer, about 5 N for 6 ms, recorded for three seconds at 2048 Hz.
 rate, seconds, hits = 2048, 3, 5 * np.array([0.8, 1.0, 1.1, 1.3])
 
 
@@ -156,7 +156,7 @@ scipy.io.savemat(LAB / "steps.mat", {"run": np.array(runs, dtype=kinds)})
 # %% [markdown]
 # ## 1. What is in the files
 #
-# `snrmjax import FILE` without anything else writes nothing: it says what a file holds, and a
+# `snrmjax import FILE` without options writes nothing: it lists the contents of a file, and a
 # command line that would import it.
 
 # %%
@@ -164,9 +164,9 @@ typed("snrmjax import impact.unv")
 typed("snrmjax import steps.mat")
 
 # %% [markdown]
-# The universal file says everything: quantity, unit and place of both sides. The MATLAB file says
-# little. Its names are a guess at frequency, force, acceleration and phase; units are nowhere; the
-# three entries of the struct are the levels. And nobody says in which direction a phase is counted.
+# The universal file states everything: quantity, unit and location of both sides. The MATLAB file
+# states little. Its names are a guess at frequency, force, acceleration and phase; units are missing; the
+# three entries of the struct are the levels. The sign convention of the phase is not stated either.
 
 # %% tags=["hide-input"]
 # Left: acceleration over force of the hammer with two resonances. Right: the three levels of the
@@ -186,8 +186,8 @@ right.legend(frameon=False, fontsize=drawing.SMALL)
 figure
 
 # %% [markdown]
-# Over the force, the three levels part at resonance: it moves up, and is damped more. That is what
-# the backbone is to say in numbers.
+# Divided by the force, the three levels differ at resonance: its frequency rises, and so does its
+# damping. The backbone quantifies this.
 #
 # ## 2. The linear modes of the hammer
 #
@@ -201,16 +201,16 @@ first = float(model.modes.natural_frequency[0])
 headline["the first natural frequency is that of the arm, within 0.01 %"] = (
     abs(first / REST[0] - 1) < 1e-4
 )
-# The air at the tip damps the hammer's motion too: 0.8 % is that of no motion at all.
+# The air at the tip damps the hammer's motion too: 0.8 % is that at zero amplitude.
 headline["its damping ratio is that of the arm, within 2 %"] = (
     abs(float(model.modes.damping_ratio[0]) / RATIO[0] - 1) < 0.02
 )
 
 # %% [markdown]
-# ## 3. The map, and what is wrong with it
+# ## 3. The map, and its error
 #
-# The colleague's word is "g" and "degrees"; force in N is what the load cell says. Phases that lead
-# are the habit of this house, so that is what the import assumes, and says so.
+# The colleague stated "g" and "degrees"; the load cell is in N. The import assumes phases that
+# lead, the convention of this package, and reports the assumption.
 
 # %%
 typed(
@@ -224,9 +224,9 @@ headline["the check finds the phase that is counted the other way, and nothing e
 ] == ["conjugated_response"]
 
 # %% [markdown]
-# With the model, the check knows which way a phase must turn through resonance and that a mode
-# cannot have a negative damping. The phase belongs to an *acceleration*: read the other way, its
-# velocity is conjugated and changes sign, so that this one key of the map mends both. The map of
+# With the model, the check knows in which direction the phase changes through resonance, and that a
+# mode cannot have negative damping. The phase belongs to an *acceleration*: with the wrong sign its
+# velocity is conjugated and changes sign, so this one key of the map corrects both. The map of
 # the first import has everything else.
 
 # %%
@@ -237,10 +237,10 @@ headline["after that the check finds nothing"] = (
 )
 
 # %% [markdown]
-# A unit that is wrong is seen as well, as long as the two files disagree. With m/s² for g the steps
-# ask for 9.6 times the modal mass of the hammer (9.81, but for a nonlinearity that is larger than
-# its amplitudes say). Which number is wrong, force, response or shape, no check can know: it names
-# the usual ones, and the factor is the clue.
+# A wrong unit is detected as well, as long as the two files disagree. With m/s² for g the steps
+# give 9.6 times the modal mass of the hammer test (9.81, but for a nonlinearity that is larger than
+# at the recorded amplitudes). No check can decide which is wrong, force, response or shape: it
+# lists the usual causes, and the factor is the clue.
 
 # %%
 typed("snrmjax import steps.mat --map mended/map.toml --unit m/s^2 --out other_unit")
@@ -253,7 +253,7 @@ headline["the check sees a wrong unit by the modal mass"] = bool(found)
 
 # %%
 # Natural frequency and damping against velocity: the identified points lie on the dashed line of
-# the sensor that shows 5 % too little, beside the line of the arm.
+# the sensor that reads 5 % low, next to the line of the arm.
 states = sj.io.read_steady_states(LAB / "mended" / "measured.csv", model)
 identified = sj.identify_backbone(states, model.modes)
 print(identified)
@@ -261,7 +261,7 @@ points = identified.points
 velocity, natural = np.asarray(points.backbone_velocity), np.asarray(points.natural_frequency)
 damping = np.asarray(points.damping_ratio)
 
-# What the equations of the arm say, to first order in the amplitude x of the tip.
+# From the equations of the arm, to first order in the amplitude x of the tip.
 tip = np.linspace(0, 1.4e-3, 100)  # m
 stiffer = np.sqrt(REST[0] ** 2 + 0.75 * HARDENING * SHAPE[0, 0] ** 2 * tip**2)
 damped = (RATIO[0] * REST[0] + 4 / (3 * np.pi) * AIR * SHAPE[0, 0] ** 2 * stiffer * tip) / stiffer
@@ -283,7 +283,7 @@ figure
 # %%
 as_seen = np.interp(velocity, GAIN * moved, stiffer)
 loss = np.interp(velocity, GAIN * moved, damped)
-# Noise of 0.3 % of a phasor is 0.3 % of the half-width at resonance, some 1e-3 Hz, more off it.
+# Noise of 0.3 % of a phasor is 0.3 % of the half-width at resonance, about 1e-3 Hz, more off resonance.
 headline["on the sensor's axis all natural frequencies are within 0.05 %"] = bool(
     np.abs(natural / as_seen - 1).max() < 5e-4
 )
@@ -292,14 +292,14 @@ headline["on the sensor's axis the median damping ratio is within 1 %"] = bool(
 )
 
 # %% [markdown]
-# ## 5. What the check cannot see
+# ## 5. What the check cannot detect
 #
-# The points lie on the dashed line, not on the grey one: the accelerometer shows 5 % too little,
-# in the hammer's test as in the steps. **Files that agree with each other may be wrong together.**
-# The check compares them, the modal mass of one with that of the other, and is content.
+# The points lie on the dashed line, not on the grey one: the accelerometer reads 5 % low,
+# in the hammer test as in the steps. **Files that agree with each other may share an error.**
+# The check compares the modal mass of one with that of the other, and finds nothing.
 #
-# Frequencies, the linear damping and the form of the curves do not feel it. All amplitudes do, and
-# whoever reads a spring off the backbone gets the error three times: twice by the amplitude, once
+# Frequencies, the linear damping and the form of the curves are not affected. All amplitudes are,
+# and a spring constant from the backbone has the error three times: twice by the amplitude, once
 # by the mode shape that the same sensor scaled.
 
 # %%
@@ -313,7 +313,7 @@ headline["the spring is too stiff by the gain three times over, within 2 %"] = b
 )
 
 # %% [markdown]
-# What does see it is a mass that was weighed: a second hammer test with it on the tip
+# A known mass detects it: a second hammer test with it on the tip
 # (`snrmjax modes impact.unv --added-mass 0.05 --mass-at 1+z --with-mass heavier.unv`) scales the
 # shapes without the sensor's gain, and the two modal masses differ by 5 %. Or the accelerometer
 # on a calibrator.

@@ -10,17 +10,17 @@
 # ---
 
 # %% [markdown]
-# # The field's other methods on the same data
+# # Other identification methods on the same data
 #
-# Whoever has a nonlinear structure on a shaker may choose among many methods. Here several of
-# them see the same structures, the same noise and, where they can, the same states:
+# Many methods identify a nonlinear structure on a shaker. Here several of them are applied to the
+# same structures, the same noise and, where possible, the same states:
 #
 # 1. one table of steady states, six methods: the flat beam with measurement noise;
-# 2. loops that hold what an open loop loses: a one-sided stop on a shaker;
-# 3. free decays read in three ways, beside a stepped sine of the same structure;
-# 4. the whole comparison (seven structures, three noises, 20 seeds), and what it says about ours.
+# 2. control loops that stabilise what an open loop loses: a one-sided stop on a shaker;
+# 3. free decays evaluated in three ways, and a stepped sine of the same structure;
+# 4. the whole comparison (seven structures, three noises, 20 seeds), and what it shows about ours.
 #
-# All methods answer alike, with a `MethodResult`: natural frequency and damping ratio against the
+# All methods return a `MethodResult`: natural frequency and damping ratio against the
 # velocity amplitude at resonance, 1σ where the method has one, a status at every point.
 
 # %%
@@ -52,19 +52,19 @@ headline = {}
 # The flat clamped beam of the method's paper, simulated with its four modes and nine harmonics:
 # four levels of force, twelve states each within 75° of resonance, errors of 0.5 % of amplitude
 # and 0.5° of phase. The truth is the resonance (velocity in phase with the force) of exact
-# responses, which no method sees. The methods:
+# responses, unknown to the methods. The methods:
 #
 # - *inverse SNRM*: Kwarta & Allen, this package's own;
 # - *CONCERTO* (Carrella & Ewins 2011): pairs of frequencies of equal amplitude on both sides;
-# - *describing functions* (Arslan & Özgüven 2008), the nonlinear element's place known;
+# - *describing functions* (Arslan & Özgüven 2008), the location of the nonlinear element known;
 # - *response-controlled tests* (Karaağaçlı & Özgüven 2020): modal fits at constant amplitude, and
-#   the *harmonic force surface*. Its authors hold amplitudes in the test; here surfaces are cut
-#   from levels of constant force, which is not how they test;
+#   the *harmonic force surface*. Its authors control amplitudes in the test; here surfaces are interpolated
+#   from levels of constant force, unlike their tests;
 # - *phase resonance* (Peeters, Kerschen & Golinval 2011): each level's crossing of 0°.
 
 # %% tags=["hide-input"]
 # Error of frequency and of damping against velocity by six methods: inverse SNRM, describing
-# functions and phase resonance scatter about zero, the others lie beside it.
+# functions and phase resonance scatter about zero, the others are biased.
 beam = sj.model.flat_beam()
 ends = (60 * HERTZ, 120 * HERTZ)
 forces = (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2)
@@ -119,10 +119,10 @@ drawing.legend(figure)
 figure
 
 # %% [markdown]
-# Methods that read the force balance state by state (ours, describing functions) and phase
-# resonance have no error but the noise's. CONCERTO and the modal fits assume a linear mode of
+# Methods that use the force balance of each state (ours, describing functions) and phase
+# resonance have only the errors of noise. CONCERTO and the modal fits assume a linear mode of
 # constant amplitude between two states: where the modal mass of the beam's deflected shape
-# differs, and where levels are few, they are biased by some tenths of a percent. Far outliers lie
+# differs, and where levels are few, they are biased by a few tenths of a percent. Far outliers lie
 # beyond the figure.
 
 # %% tags=["hide-input"]
@@ -134,13 +134,13 @@ headline |= {
 }
 
 # %% [markdown]
-# ## 2. What an open loop loses, and loops hold
+# ## 2. Unstable states: open loop and control
 #
 # One mode at 50 Hz meets a stop of twice its stiffness, on a shaker with back-EMF and a moving
 # armature, with noise on both channels. A stepped sine of one voltage jumps, at different
-# frequencies upwards and downwards. A phase-locked loop (Peter & Leine 2017) walks along the
-# backbone, and phase by phase around the fold. Control-based continuation (Barton & Sieber) holds
-# the unstable part of the S-curve at one frequency by non-invasive velocity feedback.
+# frequencies upwards and downwards. A phase-locked loop (Peter & Leine 2017) follows the
+# backbone, and the response phase by phase around the fold. Control-based continuation (Barton &
+# Sieber) stabilises the unstable part of the S-curve at one frequency by non-invasive velocity feedback.
 
 # %%
 modes = sj.model.linear_modes([50 * HERTZ], [0.01], [[1.0]], [1.0])
@@ -243,13 +243,13 @@ headline |= {
 # ## 3. A decay and a stepped sine of one structure
 #
 # One mode at 50 Hz with a cubic stiffness and quadratic damping, in the same laboratory. A loop
-# holds resonance, the shaker is taken away, and the decay is read by its peaks and by
+# keeps resonance, the shaker is removed, and the decay is evaluated by its peaks and by
 # the analytic signal (resonant decay), by a force surface of acceleration over displacement and
 # velocity (Masri & Caughey 1979), and by the normal form on its spectral submanifold. A stepped
 # sine of the same structure goes to the inverse SNRM.
 
 # %% tags=["hide-input"]
-# Error of frequency and damping against velocity by three readings of a decay, a submanifold and
+# Error of frequency and damping against velocity by three evaluations of a decay, a submanifold and
 # a stepped sine: all within 0.02 % and 3 %.
 duffing = sj.model.structure(
     modes,
@@ -319,16 +319,16 @@ headline |= {
 }
 
 # %% [markdown]
-# One mode alone, and little noise: a decay of two seconds reads the curves as well as a stepped
-# sine of minutes, its damping better. With a second mode that rings along, or at amplitudes near
-# the noise, it would not.
+# One mode alone, and little noise: a decay of two seconds gives the curves as accurately as a
+# stepped sine of minutes, damping even better. With an interfering mode, or at amplitudes near the
+# noise, it would not.
 
 # %% [markdown]
-# ## 4. The whole comparison
+# ## 4. The complete comparison
 #
-# Seven structures, three steps of noise, 20 seeds (`benchmarks/methods_table.py`): the median
-# error of frequency at the middle step, and how often a 95 % band of frequency holds the truth
-# over all steps.
+# Seven structures, three noise levels, 20 seeds (`benchmarks/methods_table.py`): the median
+# error of frequency at the middle level, and the coverage of the 95 % band of frequency over all
+# levels.
 
 # %% tags=["hide-input"]
 # Median errors of frequency and damping of six methods on seven structures.
@@ -380,23 +380,23 @@ headline["ours has the smallest error of frequency for at least five of the seve
 )
 
 # %% [markdown]
-# What this says, plainly:
+# Conclusions:
 #
 # - The inverse SNRM needs neither a resonance nor a pair of states, and uses every state: its
 #   median errors are the smallest for most structures.
 # - **It is not the best everywhere.** At the stop, phase resonance has as small an error of
-#   frequency, needs no linear model for it, and is read in a minute from four levels. With
-#   quadratic damping and little noise the force surface is nearer in damping.
-# - **Its bands are not the same everywhere**: those of frequency hold less of the truth on the
+#   frequency, needs no linear model for it, and takes a minute from four levels. With
+#   quadratic damping and little noise the force surface is more accurate in damping.
+# - **Its bands are not the same everywhere**: those of frequency have lower coverage on the
 #   curved beam at the largest noise, those of damping with a bolted joint. Bands of CONCERTO and
-#   of the modal fits, which do not know the bias of their own model, hold far less.
-# - Where an open loop jumps before resonance, only loops measure the rest. They cost more time of
-#   test for each state, and a controller. **What they hold is nearer to the truth than ours on six
+#   of the modal fits, which exclude the bias of their own model, cover far less.
+# - Where an open loop jumps before resonance, only control loops measure the rest. They cost more test
+#   time per state, and a controller. **Their results are closer to the truth than ours on six
 #   structures of seven** (`benchmarks/methods_loops_and_decays.jsonl`), although the noise is not
-#   the same: there it is on samples, of which a loop averages many periods. Only where a second
-#   mode lies near is ours better, which takes the other mode's part away.
+#   the same: there it is on samples, of which a loop averages many periods. Only near a second
+#   mode is ours better, which subtracts the contribution of that mode.
 # - Decays and multisines need seconds of test, but their bands are too narrow where their
-#   polynomials are not the law, and a second mode that rings along spoils a decay.
+#   polynomials are not the law, and an interfering mode spoils a decay.
 
 # %% tags=["hide-input"]
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))

@@ -12,16 +12,16 @@
 # %% [markdown]
 # # From one load to another: a bolted joint
 #
-# A cantilever of steel rubs at a joint between its root and its middle. It was shaken at the
-# **tip**; the question is how it answers a force at **another point**, and a larger one.
+# A steel cantilever has a friction joint between its root and its middle. It was tested with a force
+# at the **tip**; the question is its response to a larger force at **another point**.
 #
-# Two ways lead there:
+# There are two ways:
 #
 # 1. *One nonlinear mode.* The near-resonant states give natural frequency and damping against
-#    amplitude. A force elsewhere moves the same mode by the shape there. Nothing needs to be known
-#    of the joint, but its mode must keep its shape.
-# 2. *The joint itself.* The beam's matrices are known; a joint of four parameters stands where
-#    the bolts are, and its parameters are fitted to the same states.
+#    amplitude. A force elsewhere excites the same mode through its shape there. The joint need not
+#    be known, but the mode must keep its shape.
+# 2. *The joint itself.* The beam's matrices are known; a joint model with four parameters at
+#    the bolts is fitted to the same states.
 
 # %%
 # %matplotlib inline
@@ -39,10 +39,10 @@ headline = {}
 # %% [markdown]
 # ## The beam, the joint and the test
 #
-# 0.71 m of steel, 50 mm high and 60 mm wide, in fourteen elements; size and stuck stiffness of the
-# joint are of the kind of the RubBeR rig (Scheel et al. 2020, doi 10.1016/j.jsv.2020.115580). The
+# 0.71 m of steel, 50 mm high and 60 mm wide, in fourteen elements; dimensions and stuck stiffness of the
+# joint are similar to the RubBeR rig (Scheel et al. 2020, doi 10.1016/j.jsv.2020.115580). The
 # joint is Segalman's four-parameter Iwan model (2005): 10 MN/m while it sticks, 30 N when all of
-# it slips. Three sensors watch the beam.
+# it slips. The beam has three sensors.
 
 # %%
 YOUNG, DENSITY, WIDTH, HEIGHT = 0.6725 * 210e9, 7850, 0.06, 0.05
@@ -107,8 +107,8 @@ print(found.joint.fit)
 # ## 2. The joint itself
 #
 # The same states and the free beam with a joint whose parameters are wrong by a third and more.
-# Every state's measured motion is put into the harmonic balance, and the force that it asks for is
-# compared with the measured one; so no fold and no start matter.
+# The measured motion of every state is prescribed in the harmonic balance, and the required force
+# compared with the measured one; so folds and starting points do not matter.
 
 # %%
 GUESS = {"slip_force": 20.0, "stiffness": 1.5e7, "exponent": -0.3, "ratio": 0.5}
@@ -125,12 +125,12 @@ headline["the joint's four parameters within 2.6 of their 1σ"] = bool(
 # %% [markdown]
 # ## The prediction at another point
 #
-# Neither has seen a force at the other point. The truth is the harmonic balance of the true beam,
-# forced there.
+# Neither used a force at the other point. The truth is the harmonic balance of the true beam with
+# the force there.
 
 # %% tags=["hide-input"]
 # Velocity of the tip against frequency at 3 N and 10 N at another point: the fitted joint lies on
-# the truth, one mode a little beside it.
+# the truth, one mode slightly off.
 moved = dataclasses.replace(fitted.model, modes=fitted.model.modes.forced_at(OTHER))
 FORCES = [3.0, 10.0]
 answers = sj.forced_response(cantilever(OTHER, PARAMETERS), FORCES, *SPAN)
@@ -171,15 +171,15 @@ headline["one mode: within 8 %, and farther off than the joint"] = all(
 )
 
 # %% [markdown]
-# Both predictions know the force's place by the shapes of the beam alone. One mode is off by some
-# per cent: as the joint slips, the mode changes its shape, and the identification says so (levels
-# that differ in gain and damping). Who needs more than that must know where the joint is.
+# Both predictions use the location of the force only through the shapes of the beam. One mode is off
+# by a few per cent: as the joint slips, the mode shape changes, and the identification reports it
+# (levels that differ in gain and damping). Higher accuracy requires the location of the joint.
 #
 # ## Two coupled modes: from data to prediction
 #
-# Two modes at 100 and 103 rad/s share a hardening stiffness. Two sensors watch; the force excites
-# both. Is one mode enough? Plain `identify` looks when the sensors show a second mode that moves
-# more than the force alone moves it.
+# Two modes at 100 and 103 rad/s share a hardening stiffness. There are two sensors; the force excites
+# both modes. Is one mode enough? `identify` tests this when the sensors show a second mode with
+# more motion than the force alone would cause.
 
 # %%
 LINEAR = sj.model.linear_modes(
@@ -209,7 +209,7 @@ for note in coupled.notes:
     print("note:", note)
 
 # %% [markdown]
-# It does, and says by how much the backbone of one mode is wrong at the largest amplitude. With
+# It does, and states the error of the single-mode backbone at the largest amplitude. With
 # `modes=2` (`snrmjax identify --modes 2`) the responses come from the fitted model of both:
 
 # %% tags=["hide-input"]

@@ -10,20 +10,20 @@
 # ---
 
 # %% [markdown]
-# # A measured bolted beam, from its files to what is missing
+# # A measured bolted beam, from its files to the missing physics
 #
 # Two beams bolted at a lap joint, hung freely and shaken at a point with an accelerometer: the
 # Brake–Reuss beam near 80 Hz. Two tables of stepped sines, of two tests:
 #
-# - `response_controlled.csv`, eight levels of constant response, on which all of this is built;
-# - `force_controlled.csv`, four levels of constant force, kept aside until the end.
+# - `response_controlled.csv`, eight levels of constant response, used throughout;
+# - `force_controlled.csv`, four levels of constant force, withheld until the end.
 #
-# The way: look, check, linear modes, backbone and damping with bands, the diagnosis of what a
-# linear model lacks, the completed model, and predictions of levels that nothing had seen.
+# Steps: plot, check, linear modes, backbone and damping with bands, the diagnosis of what a
+# linear model lacks, the completed model, and predictions of withheld levels.
 #
 # Measured by Chen et al., MSSP 166 (2022) 108401, tables of
 # mattiacenedese/BRBtesting (GPL-3.0); accelerations were divided by iΩ, phases are of the force.
-# They are not part of this project: give their folder in the environment variable MEASURED_DATA.
+# They are not part of this project: set their folder in the environment variable MEASURED_DATA.
 
 # %%
 # %matplotlib inline
@@ -54,7 +54,7 @@ print(built_on)
 
 # %% tags=["hide-input"]
 # Velocity over force against frequency for eight levels of response: the peak falls from 0.34 to
-# 0.08 m/s per newton as the level rises, becomes broad, and moves by some 0.2 Hz.
+# 0.08 m/s per newton as the level rises, broadens, and shifts by about 0.2 Hz.
 figure, grid = drawing.panels(drawing.COLUMN, 3.2, 1, 1)
 level = np.asarray(built_on.level)
 mobility = np.abs(np.asarray(built_on.velocity)[:, 0]) / np.asarray(built_on.force)
@@ -70,10 +70,10 @@ drawing.legend(figure)
 figure
 
 # %% [markdown]
-# The resonance is damped five times more at the largest level than at the smallest, while it moves
-# down by a quarter of a hertz and up again: a joint that slips does the first.
+# Damping is five times larger at the largest level than at the smallest, while the resonance shifts
+# down by a quarter of a hertz and up again: joint slip causes the first.
 # The check looks for the usual mistakes, with the linear modes of the lowest level. The
-# accelerometer sits where the force acts, so that the modal mass comes from the same states.
+# accelerometer is at the drive point, so the modal mass follows from the same states.
 
 # %%
 linear = sj.pipelines.find_linear_modes(built_on, drive_point="sensor 1", name="bolted beam")
@@ -90,16 +90,16 @@ findings = sj.doctor.check_test([built_on, kept_aside], model, [])
 print("the check finds:", findings or "nothing")
 
 # %% [markdown]
-# Even 10 mm/s is not linear: by how much the joint moves the mode below that is added to the errors
-# of the linear modes, as the notes say.
+# Even 10 mm/s is not linear: the shift of the mode by the joint below that level is added to the
+# errors of the linear modes, as the notes state.
 #
 # ## 2. Backbone and damping, with bands
 #
 # All 328 states together give two smooth curves. No noise is stated; the fit estimates it, finds
-# that neighbouring states miss the curves alike, and counts only some 34 of the 328 as independent.
+# correlated residuals of neighbouring states, and counts only about 34 of the 328 as independent.
 
 # %%
-# Natural frequency and damping against amplitude: frequency dips by 0.2 Hz and comes back, damping
+# Natural frequency and damping against amplitude: frequency dips by 0.2 Hz and recovers, damping
 # rises from 0.16 to 0.76 %; single states scatter far outside the bands.
 fit = sj.fit_jointly(built_on, modes)
 print(fit)
@@ -120,17 +120,17 @@ for part in found.located:
     print(f"located: {part.part.replace('_', ' ')}, {low:.3g} to {high:.3g} m/s{power}")
 
 # %% [markdown]
-# **The answer is "unknown", and that is the honest one.** What is sure is where the model
-# fails: damping grows with amplitude, stiffness changes, and a part of the misfit is no function of
-# amplitude. Of the effects that explain it,
+# **The verdict is `unknown`, and rightly so.** It is clear where the model
+# fails: damping grows with amplitude, stiffness changes, and part of the misfit is not a function
+# of amplitude. Of the effects that explain it,
 #
-# - a *residual receptance* of −6 µm/N at the drive point gains by far the most. It is no
-#   nonlinearity: other modes and the rigid-body motion of a free beam have this sign and size, and
-#   a model of one mode leaves them out. It is visible without any fit: apparent damping falls along
+# - a *residual receptance* of −6 µm/N at the drive point gains by far the most. It is not
+#   a nonlinearity: other modes and the rigid-body motion of a free beam have this sign and
+#   magnitude, and a model of one mode neglects them. It is visible without any fit: apparent damping falls along
 #   every level, at the smallest as at the largest;
-# - beside it *damping that grows* is needed. Several laws imitate it alike with one sensor and no
-#   harmonics. That the best attempt takes an internal resonance for it is not to be believed:
-#   there is no second mode in the data at all.
+# - in addition *damping that grows* is needed. With one sensor and no harmonics several laws fit it
+#   equally well. The internal resonance in the best attempt is not credible: the data show no
+#   second mode at all.
 
 # %%
 # Bars: how much of the misfit each effect explains by itself; the residual receptance leads with
@@ -138,10 +138,10 @@ for part in found.located:
 plot.candidates_figure(found)
 
 # %% [markdown]
-# ## 4. The completed model, and levels that it had not seen
+# ## 4. The completed model, and withheld levels
 #
-# Wrong or right, the completed model is judged by levels 5 and 8, left out of a fit of its own.
-# Level 8 lies beyond all that this fit saw.
+# The completed model is assessed on levels 5 and 8, withheld from a separate fit. Level 8 lies
+# beyond the range of this fit.
 
 # %%
 gap = found.gap
@@ -168,15 +168,14 @@ headline[
 plot.comparison_figure(predicted.before, predicted.after, built_on)
 
 # %% [markdown]
-# The gap shrinks from factors of 2.6 and 4.4 to less than a tenth; it does not close. Peaks come
-# out too high at the upper levels and 16 % too low at the lowest: the damping law is not the true
-# one, as the diagnosis said.
+# The gap shrinks from factors of 2.6 and 4.4 to less than a tenth; it does not close. Peaks are
+# too high at the upper levels and 16 % too low at the lowest: the damping law is not the true
+# one, as the diagnosis stated.
 #
 # ## 5. Another test
 #
-# Now the table that was kept aside. Its phase resonances, where the phase crosses 0°, can be read
-# without a method. The curves of section 2 predict them from the force alone; no effect needs a
-# name for that.
+# Now the withheld table. Its phase resonances, where the phase crosses 0°, need no method. The
+# curves of section 2 predict them from the force alone, without a named effect.
 
 
 # %%
@@ -232,14 +231,14 @@ drawing.legend(figure)
 figure
 
 # %% [markdown]
-# ## What these data cannot tell
+# ## What these data do not determine
 #
 # - **Which law damps the joint.** One sensor and one harmonic leave several; the amplitudes span a
 #   factor of 16. Harmonics with their noise floor, or a sensor on either side of the joint, would.
-# - **Whether a level is wrong as a whole.** Levels differ in gain, phase, frequency and damping by
-#   what the notes say; nobody stated it. A repeated level would tell drift from physics.
-# - **How good "good" is.** Without a stated noise, what is left is taken for noise.
-# - **The modal mass to better than some 10 %**: that is how much the lowest levels of the two tests
+# - **Whether a level has a common error.** Levels differ in gain, phase, frequency and damping as
+#   the notes state; no error is stated. A repeated level would separate drift from physics.
+# - **The goodness of fit.** Without a stated noise, the residual is taken as noise.
+# - **The modal mass to better than about 10 %**: that is how much the lowest levels of the two tests
 #   differ. Every force and every damping ratio has this error. A known added mass decides.
 # - **What lies beyond 0.16 m/s.**
 

@@ -48,13 +48,13 @@ SUB_ROOMS = {
         *(
             "model.effect_base",
             "model.effect_metadata",
-            "model.kinks",
+            "model.nonsmooth_points",
             "model.modes",
             "model.potential",
         ),
     },
     "measure.recordings": {"measure.signals", "measure.states"},
-    # One mode of a free decay apart from its company.
+    # One mode of a free decay, separated from interfering modes.
     "measure.decays": {"measure.recordings", "measure.signals", "measure.states"},
     "measure.sweeps": {"measure.recordings", "measure.signals", "measure.states"},
     "simulate.balance": set(),

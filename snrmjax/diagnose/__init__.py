@@ -21,5 +21,8 @@ All thresholds are in `priors` and `identify.test_model.priors`, each with its r
 
 import lazy_loader
 
+from snrmjax.numerics.names import with_retired_names
+
 # The public names are in `__init__.pyi`; each module is imported with its first name.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__ = with_retired_names(__name__, __getattr__, {"Whereabouts": "Localisation"})

@@ -265,10 +265,8 @@ def _shape(mode: TomlTable) -> TomlTable:
         raise ValueError(f"{table.location} must have at least one sensor.")
     for sensor in table.entries:
         if sensor != sensor.strip() or sensor == "" or not sensor.isprintable():
-            raise ValueError(
-                f"the name of a sensor must be a text without spaces around it, "
-                f"but {table.location} has {sensor!r}."
-            )
+            must = "the name of a sensor must be a text without spaces around it"
+            raise ValueError(f"{must}, but {table.location} has {sensor!r}.")
         table.number(sensor)
     return table
 
@@ -282,9 +280,8 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
         except ValueError as error:
             raise ValueError(f"{table.location} cannot be read: {error}") from error
         if monomial in coefficients:
-            raise ValueError(
-                f"{table.location} has the monomial {name!r} twice (the order of modes is free)."
-            )
+            twice = f"{table.location} has the monomial {name!r} twice"
+            raise ValueError(f"{twice} (the order of modes is free).")
         if isinstance(value, dict):
             entry = TomlTable(value, f"monomial {name!r} in {table.location}")
             entry.check_keys(("coefficient",), ("std",))

@@ -75,10 +75,12 @@ def base_excited_states(
         sensors=tuple(sensors),
         **rotated,
     )
-    return relative_to_base(states, base_motion("relative" if relative else "absolute", along))
+    return states_relative_to_base(
+        states, base_motion("relative" if relative else "absolute", along)
+    )
 
 
-def relative_to_base(data: SteadyStates, base: BaseMotion) -> SteadyStates:
+def states_relative_to_base(data: SteadyStates, base: BaseMotion) -> SteadyStates:
     """Convert states with recorded velocities and the base acceleration as `force`.
 
     Returns velocities relative to the base, with propagated errors of amplitude and phase.

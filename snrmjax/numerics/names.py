@@ -1,7 +1,9 @@
-"""Suggestions for misspelt names in error messages."""
+"""Names: suggestions for misspelt ones in error messages, and aliases of former public ones."""
 
 import difflib
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 
 def near_miss(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
@@ -25,3 +27,25 @@ def suggestion(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """
     near = near_miss(name, known, cutoff)
     return "" if near is None else f" (did you mean `{near}`?)"
+
+
+def with_retired_names(
+    package: str, current: Callable[[str], Any], names: Mapping[str, str]
+) -> Callable[[str], Any]:
+    """The `__getattr__` of a package, with `names` from former to present ones.
+
+    A former name gives the present object with a `DeprecationWarning`.
+    """
+
+    def attribute(name: str) -> Any:
+        if name not in names:
+            return current(name)
+        warnings.warn(
+            f"{package}.{name} is now {package}.{names[name]}: the former name goes in the next "
+            "release.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return current(names[name])
+
+    return attribute

@@ -28,7 +28,7 @@ from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import check_driven_alike, read_steady_states
-from snrmjax.measure.base_excitation import relative_to_base
+from snrmjax.measure.base_excitation import states_relative_to_base
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.time_recording import TimeRecording
@@ -76,7 +76,7 @@ class NamedStates(NamedTuple):
                 f"{', '.join(modes.sensors)}."
             )
         check_driven_alike(states, modes, self.file)
-        return states if modes.base is None else relative_to_base(states, modes.base)
+        return states if modes.base is None else states_relative_to_base(states, modes.base)
 
 
 class NamedResponses(NamedTuple):

@@ -30,7 +30,7 @@ TEXT, SMALL = 9.0, 8.5  # points: of titles and labels, and of ticks, legends an
 MEASURED, IDENTIFIED, SIMULATED, EXCLUDED = "#0072B2", "#D55E00", "black", "0.55"
 BACKGROUND = "0.72"  # of a curve to compare with, broad behind another one
 SERIES = (IDENTIFIED, MEASURED, "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Colours that colour-blind readers can tell apart (Okabe & Ito)."""
+"""Colours that colour-blind readers can distinguish (Okabe & Ito)."""
 
 CROWD = 120
 """From this number of points on they are drawn small."""

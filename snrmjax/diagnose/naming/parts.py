@@ -7,18 +7,14 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose import priors
+from snrmjax.diagnose.naming.assessed import DRAWN, Assessed, Laws, classes_of
 from snrmjax.diagnose.naming.columns import is_instrument, parameters_of
 from snrmjax.diagnose.naming.rows import Cell, Problem, Solved, solved
-from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
 
-DRAWN = {"stiffness": StiffnessLaw.kind, "damping": DisplacementDampingLaw.kind}
-"""Effect kinds of the remainder of each part."""
 _CELLS = 100  # most probable hypotheses that are solved
 _NOT_NOISE = float(np.log(priors.NAMED / (1 - priors.NAMED)))  # ln odds of `NAMED`
 _DRAWS = 500  # samples of the explained fraction
 _POINTS = 60  # of a drawn remainder
-
-Laws = tuple[str, ...]
 
 
 class Explained(NamedTuple):
@@ -98,25 +94,6 @@ class Naming(NamedTuple):
 _Negligible = tuple[np.ndarray, Callable[[np.ndarray], bool]]
 
 
-class _Assessed(NamedTuple):
-    """One hypothesis, assessed part by part."""
-
-    weight: float
-    cell: Cell
-    solved: Solved
-    laws: dict[str, Laws]  # significant ones, by part
-    left: dict[str, bool]  # whether the remainder is significant, by part
-
-    @property
-    def changes_nothing(self) -> bool:
-        """Whether no part has a significant law or remainder."""
-        return not (any(self.laws.values()) or any(self.left.values()))
-
-    def instead(self, part: str) -> Laws:
-        """Instrument errors with which a part needs neither a law nor a remainder."""
-        return () if self.laws[part] or self.left[part] else self.laws["instrument"]
-
-
 def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     """The answer by parts from the hypotheses of a test's readings."""
     cells = cells[:_CELLS]
@@ -133,7 +110,7 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
         laws = tuple(sorted({*drawn, *(law for part in one.laws.values() for law in part)}))
         answers[laws] = answers.get(laws, 0.0) + one.weight
     answers = dict(sorted(answers.items(), key=lambda pair: -pair[1]))
-    classes = {part: _classes(assessed, part) for part in (*problem.parts, "instrument")}
+    classes = {part: classes_of(assessed, part) for part in (*problem.parts, "instrument")}
     wanted = {kind for effects, _, _ in classes.values() for kind in effects}
     with_all = [
         one for one in assessed if wanted <= {k for some in one.laws.values() for k in some}
@@ -155,7 +132,7 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     )
 
 
-def _parameters(problem: Problem, one: _Assessed, wanted: set[str]) -> dict[str, Strength]:
+def _parameters(problem: Problem, one: Assessed, wanted: set[str]) -> dict[str, Strength]:
     """Parameters of a hypothesis' laws, with 1σ from the strengths alone."""
     parameters: dict[str, Strength] = {}
     std = np.sqrt(np.diag(one.solved.covariance))
@@ -217,7 +194,7 @@ def _rest(problem: Problem, cell: Cell, part: str) -> slice:
 
 def _assessed(
     problem: Problem, cell: Cell, weight: float, negligible: dict[str, _Negligible]
-) -> _Assessed:
+) -> Assessed:
     solution = solved(problem, cell)
     k = len(cell.columns)
     std = np.sqrt(np.diag(solution.covariance))[:k]
@@ -254,7 +231,7 @@ def _assessed(
             }
         )
     )
-    return _Assessed(weight, cell, solution, laws, left)
+    return Assessed(weight, cell, solution, laws, left)
 
 
 def log_odds_of_remainder(problem: Problem, cell: Cell, solution: Solved, part: str) -> float:
@@ -294,9 +271,9 @@ def _rms(values: np.ndarray) -> float:
 
 def _part(
     problem: Problem,
-    assessed: list[_Assessed],
+    assessed: list[Assessed],
     part: str,
-    best: _Assessed,
+    best: Assessed,
     answer: tuple[Laws, tuple[Laws, ...], float],
 ) -> PartAnswer:
     """The answer for a part, from the probabilities of laws over all hypotheses."""
@@ -331,71 +308,8 @@ def _part(
     return PartAnswer(part, verdict, effects, candidates, probability, explained, remainder)
 
 
-def _classes(assessed: list[_Assessed], part: str) -> tuple[Laws, tuple[Laws, ...], float]:
-    """Effects of a part with their alternatives, and their joint probability."""
-    inclusion = _inclusion(assessed, lambda one: one.laws[part])
-    most = max(inclusion.values(), default=0.0)
-    if part in DRAWN and 1 - priors.NAMED < most < priors.NAMED:
-        law = max(inclusion, key=lambda law: inclusion[law])
-        assessed = _with_instrument_errors(assessed, part, law)
-        inclusion = _inclusion(assessed, lambda one: one.laws[part])
-    ranked = sorted(inclusion, key=lambda law: -inclusion[law])
-    if not ranked or sum(one.weight for one in assessed if one.laws[part]) < 0.5:
-        return (), (), 0.0
-    first, left = ranked[0], ranked[1:]
-    group = [first]
-    for law in left:
-        if sum(inclusion[one] for one in group) >= priors.NAMED:
-            break
-        both = sum(
-            one.weight for one in assessed if law in one.laws[part] and first in one.laws[part]
-        )
-        if inclusion[law] >= 0.02 and both < 0.5 * inclusion[law]:
-            group.append(law)
-    groups = [tuple(group)]
-    for law in left:
-        if law not in group and inclusion[law] >= 0.5:
-            groups.append((law,))
-    probability = sum(
-        one.weight
-        for one in assessed
-        if all(any(law in one.laws[part] for law in group) for group in groups)
-    )
-    return tuple(group[0] for group in groups), tuple(groups), float(probability)
-
-
-def _inclusion(assessed: list[_Assessed], laws: Callable[[_Assessed], Laws]) -> dict[str, float]:
-    """Inclusion probability of every law."""
-    inclusion: dict[str, float] = {}
-    for one in assessed:
-        for law in laws(one):
-            inclusion[law] = inclusion.get(law, 0.0) + one.weight
-    return inclusion
-
-
-def _with_instrument_errors(assessed: list[_Assessed], part: str, law: str) -> list[_Assessed]:
-    """Instrument errors that are alternatives of a part's law count as one of its laws.
-
-    At resonance an offset of the force has the same effect as friction: neither of them is
-    certain, but one or the other is.
-    """
-    anywhere = _inclusion(assessed, lambda one: one.laws["instrument"])
-    instead = _inclusion(assessed, lambda one: one.instead(part))
-    both = _inclusion(assessed, lambda one: one.laws["instrument"] if law in one.laws[part] else ())
-    alternatives = {
-        kind
-        for kind, p in instead.items()
-        if p >= 0.02 and anywhere[kind] < priors.NAMED and both.get(kind, 0.0) < 0.5 * p
-    }
-    laws = ({*one.laws[part], *(alternatives & {*one.instead(part)})} for one in assessed)
-    return [
-        one._replace(laws={**one.laws, part: tuple(sorted(some))})
-        for one, some in zip(assessed, laws, strict=True)
-    ]
-
-
 def _explained(
-    problem: Problem, assessed: list[_Assessed], part: str, candidates: tuple[Laws, ...]
+    problem: Problem, assessed: list[Assessed], part: str, candidates: tuple[Laws, ...]
 ) -> Explained:
     """The fraction of a part's change explained by its laws, by posterior sampling."""
     named = {law for group in candidates for law in group}
@@ -438,9 +352,7 @@ def _rms_of(curves: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(np.abs(curves) ** 2, axis=1))
 
 
-def _remainder(
-    problem: Problem, assessed: list[_Assessed], part: str, best: _Assessed
-) -> Remainder:
+def _remainder(problem: Problem, assessed: list[Assessed], part: str, best: Assessed) -> Remainder:
     readings = problem.readings
     x = np.geomspace(np.min(readings.relative_amplitude), 1.0, _POINTS)
     natural = readings.natural_frequency

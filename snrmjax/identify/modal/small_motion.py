@@ -165,9 +165,8 @@ def parts_of_decay(
         fitted, spread = fit_and_spread
         added = fitted.residuals[:, : None if later is None else later.first - first]
         settled = _of_noise(added, noise)
-        parts.append(
-            PartFit(first, float(time[-1]), fitted, settled, _chi_square_of_change(fitted), spread)
-        )
+        change = _chi_square_of_change(fitted)
+        parts.append(PartFit(first, float(time[-1]), fitted, settled, change, spread))
         if later is not None and later.settled and not settled:
             break
     return parts[::-1]
@@ -188,11 +187,8 @@ def _begins(amplitude: np.ndarray, omega: float, rate: float) -> list[int]:
     begins = [0]
     fewest = max(_FEWEST_SAMPLES, _FEWEST_CYCLES * HERTZ / omega * rate)
     for k in range(1, _HALVINGS + 1):
-        first = (
-            int(np.argmax(amplitude <= amplitude[0] * 0.5**k))
-            if amplitude[-1] <= amplitude[0] * 0.5**k
-            else 0
-        )
+        low = amplitude <= amplitude[0] * 0.5**k
+        first = int(np.argmax(low)) if low[-1] else 0
         rest = amplitude[first:]
         if not first or len(rest) < fewest or np.sqrt(np.sum(rest**2) / 2) < _STRENGTH:
             break
@@ -400,8 +396,8 @@ def _refusal(
     """
     begin, omega = last_begin
     first, last = (frequency_at(values, at, rate, omega) for at in (0, begin))
-    linear = [part for part in parts if not part.depends_on_amplitude and part.settled]
     words = "no part of the record is linear within noise"
+    linear = [part for part in parts if not part.depends_on_amplitude and part.settled]
     if linear:
         (natural, ratio), (std, ratio_std) = linear[0].limit()
         words = (
@@ -412,10 +408,10 @@ def _refusal(
         )
     return (
         "the decay is not that of linear modes: frequency or damping change as the motion falls "
-        f"({first:.5g} Hz at the largest value, {last:.5g} Hz "
-        f"{begin / rate:.4g} s later), and {why}, so that their values at zero "
-        f"amplitude are not known. {words[0].upper()}{words[1:]}. A longer record with less noise "
-        "reaches smaller motion; `snrmjax compare` gives frequency and damping over the amplitude."
+        f"({first:.5g} Hz at the largest value, {last:.5g} Hz {begin / rate:.4g} s later), and "
+        f"{why}, so that their values at zero amplitude are not known. {words[0].upper()}"
+        f"{words[1:]}. A longer record with less noise reaches smaller motion; `snrmjax compare` "
+        "gives frequency and damping over the amplitude."
     )
 
 
@@ -427,9 +423,8 @@ def frequency_at(
     part = values[:, first : first + length]
     part = part - part.mean(axis=1, keepdims=True)
     padded = 16 * part.shape[1]
-    power = np.sum(
-        np.abs(np.fft.rfft(part * np.hanning(part.shape[1]), padded, axis=1)) ** 2, axis=0
-    )
+    spectrum = np.fft.rfft(part * np.hanning(part.shape[1]), padded, axis=1)
+    power = np.sum(np.abs(spectrum) ** 2, axis=0)
     return float(np.argmax(power)) * rate / padded
 
 
@@ -441,9 +436,8 @@ def _at_the_end(fitted: DecayFit, time: np.ndarray) -> np.ndarray:
     by_power = amplitude ** np.array(fitted.form.powers, dtype=float)
     decay, rotation = fitted.unknowns[2 * n :].reshape(2, n_powers) @ by_power
     omega, ratio = fitted.unknowns[[k, n + k]]
-    rate = omega * ratio + decay
-    natural = float(np.hypot(omega * np.sqrt(1 - ratio**2) + rotation, rate))
-    return np.array([natural, rate / natural])
+    rate, damped = omega * ratio + decay, omega * np.sqrt(1 - ratio**2) + rotation
+    return np.array([np.hypot(damped, rate), rate / np.hypot(damped, rate)])
 
 
 def _chi_square_of_change(fitted: DecayFit) -> float:

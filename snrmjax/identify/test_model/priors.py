@@ -13,33 +13,33 @@ from jaxtyping import Float, Int
 _LOG_ROOT = 0.5 * np.log(2 * np.pi)
 
 
-class LogNormal(NamedTuple):
+class LogNormalPrior(NamedTuple):
     """A positive number whose logarithm is normal."""
 
     median: float
     spread: float  # 1σ of the logarithm
 
 
-class HalfNormal(NamedTuple):
+class HalfNormalPrior(NamedTuple):
     """A positive number: the absolute value of a normal one."""
 
     scale: float
 
 
-class Normal(NamedTuple):
+class NormalPrior(NamedTuple):
     """A normal number of mean zero."""
 
     std: float
 
 
-class LogUniform(NamedTuple):
+class LogUniformPrior(NamedTuple):
     """A positive number whose logarithm is uniform between two bounds."""
 
     low: float  # of the logarithm
     high: float
 
 
-Density = LogNormal | HalfNormal | Normal | LogUniform
+Density = LogNormalPrior | HalfNormalPrior | NormalPrior | LogUniformPrior
 
 
 class JointDensity(NamedTuple):
@@ -58,15 +58,15 @@ class JointDensity(NamedTuple):
         normal, half = [], []
         constant = 0.0
         for index, density in enumerate(densities):
-            if isinstance(density, HalfNormal):
+            if isinstance(density, HalfNormalPrior):
                 half.append((index, np.log(density.scale)))
                 constant += np.log(2) - _LOG_ROOT
-            elif isinstance(density, LogUniform):
+            elif isinstance(density, LogUniformPrior):
                 constant -= np.log(density.high - density.low)
             elif density is not None:
                 pair = (
                     (np.log(density.median), density.spread)
-                    if isinstance(density, LogNormal)
+                    if isinstance(density, LogNormalPrior)
                     else (0.0, density.std)
                 )
                 normal.append((index, *pair))
@@ -90,28 +90,28 @@ class JointDensity(NamedTuple):
         return value + self.constant, slopes
 
 
-STATED_NOISE = LogNormal(1.0, 0.1)
+STATED_NOISE = LogNormalPrior(1.0, 0.1)
 """Noise over the stated noise: a standard deviation from ten readings is good to some 20 %, and a
 laboratory states the mean of many."""
 
-UNSTATED_NOISE = LogNormal(0.004, 1.2)
+UNSTATED_NOISE = LogNormalPrior(0.004, 1.2)
 """Noise where none is stated, relative for velocities and rad for phases: analysers reach 0.05 %,
 manual readings some 3 %."""
 
 FORCE_TO_VELOCITY = 0.1
 """Unstated error of the force over that of the velocity: calibrated load cells."""
 
-LEVEL_GAIN = HalfNormal(0.05)
+LEVEL_GAIN = HalfNormalPrior(0.05)
 """Relative: drift of conditioners and of a shaker's coupling between levels; published tests show
 15 %."""
 
-LEVEL_PHASE = HalfNormal(0.02)
+LEVEL_PHASE = HalfNormalPrior(0.02)
 """rad: 1.1°, drift of a filter or controller between levels; manually run tests show 3°."""
 
-LEVEL_STIFFNESS = HalfNormal(0.008)
+LEVEL_STIFFNESS = HalfNormalPrior(0.008)
 """Relative, of ω̃²: 0.4 % of frequency, as 20 K in metals or the reseating of a joint."""
 
-LEVEL_DAMPING = HalfNormal(0.05)
+LEVEL_DAMPING = HalfNormalPrior(0.05)
 """Relative: joints and clamps reopened between levels repeat to some 10 %."""
 
 NEAR_LINEAR = (0.5, 1.5)
@@ -128,7 +128,7 @@ curve of amplitude alone lacks. Damping: −1 for dry friction and hysteresis, 1
 stiffness: 0 where harmonics are small, 0.75 on an arch, which its static and second harmonic
 soften."""
 
-LEVELS: tuple[HalfNormal, ...] = (
+LEVELS: tuple[HalfNormalPrior, ...] = (
     LEVEL_GAIN,
     LEVEL_PHASE,
     LEVEL_STIFFNESS,
@@ -160,7 +160,7 @@ CURVE_CONSTANT = 1.0
 CURVE_SLOPES = 1.0
 """1σ of their terms in a²: changes as large as the curves themselves."""
 
-CURVE_ROUGHNESS = LogNormal(1e-3, 2.0)
+CURVE_ROUGHNESS = LogNormalPrior(1e-3, 2.0)
 """1σ of the roughness at some twenty knots, over the same: from none to as large as the curve."""
 
 NO_REMAINDER = 0.3
@@ -169,13 +169,13 @@ NO_REMAINDER = 0.3
 REMAINDER_BY_CHANCE = 0.05
 """Probability of no remainder, below which the remainder of a family is fitted."""
 
-ROUGHNESS_VARIES = Normal(1.0)
+ROUGHNESS_VARIES = NormalPrior(1.0)
 """Of the logarithm of that 1σ along a curve: where joints open, roughness is thrice as large."""
 
 ROUGHNESS_LENGTH = 2.0
 """Knots over which the 1σ of the roughness is correlated."""
 
-DISCREPANCY = HalfNormal(0.1)
+DISCREPANCY = HalfNormalPrior(0.1)
 """Of Ωδ: misfit of a single-mode model off resonance. Measured beams show 1 to 5 %, slipping joints
 some 20 %."""
 

@@ -197,10 +197,8 @@ def _located_values(place: LocatedForce) -> str:
     if law is None:
         return ""
     pairs = {f"{law.kind}.{name}": (value, law.std[name]) for name, value in law.parameters.items()}
-    return (
-        f"{effect_name(law.kind)} at {place.name}, "
-        f"{values_in_words(law.kind, pairs, place.influence)}"
-    )
+    values = values_in_words(law.kind, pairs, place.influence)
+    return f"{effect_name(law.kind)} at {place.name}, {values}"
 
 
 def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure:
@@ -414,11 +412,8 @@ def _tried(row: TriedEffect) -> tuple[str, str, str]:
         f"{parameter_words(name)} {number(value, 3)} {printed_unit(row.kind, name)}".strip()
         for name, (value, _) in own.items()
     ]
-    return (
-        effect_name(row.kind),
-        _gain(row.gain) if np.isfinite(row.gain) else "not fitted",
-        ", ".join(values),
-    )
+    gain = _gain(row.gain) if np.isfinite(row.gain) else "not fitted"
+    return effect_name(row.kind), gain, ", ".join(values)
 
 
 def _gain(gain: float) -> str:

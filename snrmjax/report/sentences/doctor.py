@@ -247,8 +247,8 @@ SENTENCES: dict[str, Wording] = {
         + " of its fundamental: this part of the response harmonics is phase-locked to the force."
     ),
     "advice_harmonics": (
-        "control the harmonics of the force, or add their amplitudes to the model by the effect "
-        "`force_harmonics`."
+        "control the harmonics of the force, or add their amplitudes to the model as an effect "
+        "on the spectrum of the force."
     ),
     # Time records.
     "channel_full_scale": lambda *, fraction, n_samples, low, high: (
@@ -268,8 +268,8 @@ SENTENCES: dict[str, Wording] = {
         f"harmonic {order} of the force is {_percent(ratio)} of its fundamental."
     ),
     "advice_amplifier": (
-        "reduce the amplifier's distortion or control the harmonics; else add them to the model by "
-        "the effect `force_harmonics`."
+        "reduce the amplifier's distortion or control the harmonics; else add them to the model as "
+        "an effect on the spectrum of the force."
     ),
     "steps_move": lambda *, n_moving, n_steps, change, time_s: (
         f"in {n_moving} of {n_steps} steps the response per force has not settled: it changes by "

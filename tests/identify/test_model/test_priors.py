@@ -5,19 +5,19 @@ import pytest
 from scipy import stats
 
 from snrmjax.identify.test_model.priors import (
-    HalfNormal,
+    HalfNormalPrior,
     JointDensity,
-    LogNormal,
-    LogUniform,
-    Normal,
+    LogNormalPrior,
+    LogUniformPrior,
+    NormalPrior,
 )
 
 ALL = [
-    HalfNormal(0.05),
+    HalfNormalPrior(0.05),
     None,
-    LogNormal(0.004, 1.2),
-    Normal(0.7),
-    LogUniform(-3.0, 2.0),
+    LogNormalPrior(0.004, 1.2),
+    NormalPrior(0.7),
+    LogUniformPrior(-3.0, 2.0),
 ]
 
 

@@ -1,0 +1,67 @@
+"""The field's words: names and texts use those of the glossary, and none of the retired ones."""
+
+import ast
+import io
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+
+import snrmjax as sj
+
+PACKAGE = Path(__file__).resolve().parents[1] / "snrmjax"
+PAGES = Path(__file__).resolve().parents[1] / "notebooks" / "site" / "pages"
+
+# Former words: the glossary has what to use instead.
+RETIRED = {
+    *("share", "shares", "bends", "arms", "pulls", "walk", "walked", "company", "confusion"),
+    *("confusions", "imitation", "doubt", "doubts", "judged", "tempered", "whereabouts", "kink"),
+    *("kinks", "kinked", "tell", "tells", "told", "said", "beside"),
+}
+# In texts "to share" is a verb and no part of a whole.
+IN_TEXTS = RETIRED - {"share", "shares"}
+# Names of others, and arguments of public functions that keep their names.
+KEPT = {"beside", "walk_packages", "walk_tb", "share_frequencies", "sensor_told", "told", "doubts"}
+
+
+def words_of(name):
+    """The parts of an identifier."""
+    return [part.lower() for part in re.split(r"_|(?<=[a-z])(?=[A-Z])", name) if part]
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=str)
+def test_names_are_the_fields(path):
+    tokens = tokenize.generate_tokens(io.StringIO(path.read_text()).readline)
+    names = {token.string for token in tokens if token.type == tokenize.NAME} - KEPT
+    assert not [name for name in names if RETIRED & {*words_of(name)}]
+
+
+def test_texts_are_the_fields():
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                prose = re.sub(r"`[^`]*`", "", node.value)
+                words = IN_TEXTS & {*re.findall(r"[a-z]+", prose.lower())}
+                found += [(path.name, node.lineno, word) for word in words if " " in prose]
+    for path in [*sorted(PAGES.rglob("*.md")), PACKAGE.parent / "README.md"]:
+        prose = re.sub(r"```.*?```|`[^`]*`|{{.*?}}", "", path.read_text(), flags=re.S)
+        words = IN_TEXTS & {*re.findall(r"[a-z]+", prose.lower())}
+        found += [(path.name, 0, word) for word in words]
+    assert not found
+
+
+@pytest.mark.parametrize(
+    ("room", "former", "present"),
+    [
+        (sj.model, "AbstractKinked", "AbstractNonsmooth"),
+        (sj.model, "Confusion", "Confounder"),
+        (sj.diagnose, "Whereabouts", "Localisation"),
+    ],
+)
+def test_a_former_name_is_the_present_one_with_a_warning(room, former, present):
+    with pytest.warns(DeprecationWarning, match=present):
+        assert getattr(room, former) is getattr(room, present)
+    with pytest.raises(AttributeError):
+        getattr(room, former + "s")
