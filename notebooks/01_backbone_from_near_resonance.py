@@ -269,10 +269,10 @@ plot.modal_damping_figure(
 # hardening: the paper's curve. Both have the sharp spike at the lowest frequency, where the second
 # harmonic is as large as the fundamental.
 #
-# And the bistable interpretation? In its first well it only softens. Its large orbits pass through both
-# wells, where again only the cubic spring matters. To reach them, large states of the monostable
-# beam are followed while the cubic coefficient falls to the printed one and the force rises to
-# maintain the amplitude.
+# And the bistable interpretation? In its first well it only softens. Its large orbits pass through
+# both wells, where again only the cubic spring matters. To reach them, large states of the
+# monostable beam are followed while the cubic coefficient falls to the printed one and the force
+# rises to maintain the amplitude.
 
 # %%
 (large,) = sj.forced_response(curved, [8e-3], 40 * HERTZ, 400 * HERTZ)

@@ -108,8 +108,8 @@ figure
 # %% [markdown]
 # Between the folds the middle motion is unstable, as in textbooks. The curved beam adds
 # *period doublings* (a Floquet multiplier through −1): the motion that repeats every cycle is
-# replaced by one that repeats every second cycle, with half-order lines in the spectrum. At the largest
-# force a sweep downwards meets one at 139 Hz, long before the fold at 55 Hz.
+# replaced by one that repeats every second cycle, with half-order lines in the spectrum. At the
+# largest force a sweep downwards meets one at 139 Hz, long before the fold at 55 Hz.
 #
 # ## 2. The tip of the curve
 #
@@ -149,9 +149,9 @@ print(
 )
 
 # %% [markdown]
-# Which of them passes through the phase resonances of the responses? Each is evaluated at the velocity
-# of the resonance. The last point of the phase-locked curve has exactly the largest force, so
-# nothing is interpolated there.
+# Which of them passes through the phase resonances of the responses? Each is evaluated at the
+# velocity of the resonance. The last point of the phase-locked curve has exactly the largest force,
+# so nothing is interpolated there.
 
 # %%
 tips = [(c, c.at_events("phase_resonance")[-1]) for c in flat_responses]
@@ -378,10 +378,10 @@ drawing.name_axes(b, "(b) distance from 31 harmonics", HZ, "Relative error of th
 figure
 
 # %% [markdown]
-# For the tip of the flat beam's curve one harmonic is accurate to 0.2 %, three to 0.001 %. The curved
-# beam needs more: one harmonic makes the tip 3 % too high and misses the superharmonic resonance
-# that folds back at 40.7 Hz; with nine the error is still about 5 % at 20 Hz. The estimated
-# error is right even there: for nine motions of ten it is within a tenth of the true one.
+# For the tip of the flat beam's curve one harmonic is accurate to 0.2 %, three to 0.001 %. The
+# curved beam needs more: one harmonic makes the tip 3 % too high and misses the superharmonic
+# resonance that folds back at 40.7 Hz; with nine the error is still about 5 % at 20 Hz. The
+# estimated error is right even there: for nine motions of ten it is within a tenth of the true one.
 #
 # ## 5. What the peak and the jump depend on
 #

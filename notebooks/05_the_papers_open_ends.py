@@ -333,8 +333,8 @@ headline["the test's states would find the offset to 2 % of the lowest force"] =
 # **Conclusion: the printed numbers do not decide it, and they contradict the simplest
 # explanation.**
 #
-# - *For*: leaving out an intercept of this size makes an error as large as the observed one, as 1/F and
-#   therefore only at low amplitude.
+# - *For*: leaving out an intercept of this size makes an error as large as the observed one, as 1/F
+#   and therefore only at low amplitude.
 # - *Against the intercept left out*: the sign. It would raise the flat beam's damping; the paper
 #   observes a drop. For the curved beam no sign is printed.
 # - *Against an error of the line*: its points were found with the linear damping, so that inside
@@ -343,9 +343,9 @@ headline["the test's states would find the offset to 2 % of the lowest force"] =
 #   the force in the test was not that of the calibration at the same voltage, by up to the
 #   intercept: the drive behaved differently, or the line was used outside its
 #   voltages.
-# - *On its magnitude*: that response curves with and without the adjustment hardly differ, the lowest at
-#   1.066 mN included, allows a few per cent there: about 50 µN for 5 %, a third of the intercept.
-#   The drop itself is drawn, not printed.
+# - *On its magnitude*: that response curves with and without the adjustment hardly differ, the
+#   lowest at 1.066 mN included, allows a few per cent there: about 50 µN for 5 %, a third of the
+#   intercept. The drop itself is drawn, not printed.
 # - The paper suspects a mode shape that changes with amplitude. Such a change vanishes at low
 #   amplitude by definition: it cannot change the damping there.
 #
@@ -463,8 +463,8 @@ soft.plot()
 # that changes with amplitude; far into hardening by a gain of −12 %, which the cubic spring
 # reveals. (Not for every draw of the noise: of six in hardening, four give the gain alone, one
 # adds two further effects, one takes an added mass instead and answers `unknown`.) Where the
-# stiffness is free to follow the amplitudes, as in an identification of backbone and damping without
-# a model, a damping law is nearly as good:
+# stiffness is free to follow the amplitudes, as in an identification of backbone and damping
+# without a model, a damping law is nearly as good:
 
 # %%
 # Bars: how much each effect explains by itself; a damping law is nearly as good as the best.

@@ -192,8 +192,8 @@ headline["every member has its whole response"] = bool(np.all(ended))
 # ## 3. Bands, and the effect of each tolerance
 #
 # Between the folds a response has two stable motions at one frequency. The bands are therefore of
-# the highest motion and of the lowest; where they differ, the history of the test decides which of the
-# two it meets.
+# the highest motion and of the lowest; where they differ, the history of the test decides which of
+# the two it meets.
 
 # %% tags=["hide-input"]
 # Bands of the highest and of the lowest motion against frequency: 95 % and half of all beams, and
@@ -220,9 +220,9 @@ drawing.legend(figure)
 figure
 
 # %% [markdown]
-# The effect of one quantity by itself: the mean over the others (line, with its 95 % band) among some
-# of the members, and the fraction of the variance that it explains. Over the rise the peak is not a
-# curve but a step, at about 0.95 mm, which the mean (a spline) rounds off.
+# The effect of one quantity by itself: the mean over the others (line, with its 95 % band) among
+# some of the members, and the fraction of the variance that it explains. Over the rise the peak is
+# not a curve but a step, at about 0.95 mm, which the mean (a spline) rounds off.
 
 # %% tags=["hide-input"]
 # Peak frequency and peak velocity of every beam against thickness, rise and damping, with the
@@ -271,8 +271,8 @@ print(indices)
 plot.sensitivity_figure(indices)
 
 # %% [markdown]
-# The rise dominates: it makes the beam stiff, and makes the stiffness fall with amplitude. Thickness
-# and damping hardly affect the frequencies.
+# The rise dominates: it makes the beam stiff, and makes the stiffness fall with amplitude.
+# Thickness and damping hardly affect the frequencies.
 #
 # ## 5. Where linearisation fails
 #
@@ -301,8 +301,8 @@ print({name: f"{value:.3g}" for name, value in limit.items()})
 
 # %% [markdown]
 # The answer depends on the quantity. The fold at which a rising sweep jumps lies low, where the
-# beam is nearly linear: there first order is accurate at every scatter here. Peak and lower fold lie at
-# the internal resonance: there first order fails at a fraction of the stated tolerances.
+# beam is nearly linear: there first order is accurate at every scatter here. Peak and lower fold
+# lie at the internal resonance: there first order fails at a fraction of the stated tolerances.
 #
 # And neither includes the beams that get past the internal resonance. Against the *highest* peak of
 # all members of the study:

@@ -185,9 +185,9 @@ figure
 
 # %% [markdown]
 # The finite elements lose their stability at an inward load of about 0.38 and jump. All three
-# polynomials have a limit point there, too. They differ in whether the force comes back through zero, that is
-# whether the unloaded beam can rest in a second shape: a cubic force has a second equilibrium where
-# α² > 4 β ω².
+# polynomials have a limit point there, too. They differ in whether the force comes back through
+# zero, that is whether the unloaded beam can rest in a second shape: a cubic force has a second
+# equilibrium where α² > 4 β ω².
 
 # %%
 second = {name: a**2 / (4 * b * squared) for name, (a, b, *_) in readings.items()}
@@ -206,8 +206,8 @@ headline["the finite elements lose stability below an inward load of 0.4"] = not
 # valley of 0.23 near two thicknesses, above zero. Three times the printed cubic term gives 0.63 at
 # 3.39 and 1.07 at 3.69 thicknesses, where the other two curves are far below zero. So it is the
 # interpretation closest to the beam over the whole path: softening, then hardening, with one
-# equilibrium, as in section 3.2. It is not the expansion of the force at small displacements; one mode
-# with a cubic force cannot be both.
+# equilibrium, as in section 3.2. It is not the expansion of the force at small displacements; one
+# mode with a cubic force cannot be both.
 #
 # ## 4. The same by CalculiX
 #

@@ -165,8 +165,9 @@ typed("snrmjax import steps.mat")
 
 # %% [markdown]
 # The universal file states everything: quantity, unit and location of both sides. The MATLAB file
-# states little. Its names are a guess at frequency, force, acceleration and phase; units are missing; the
-# three entries of the struct are the levels. The sign convention of the phase is not stated either.
+# states little. Its names are a guess at frequency, force, acceleration and phase; units are
+# missing; the three entries of the struct are the levels. The sign convention of the phase is not
+# stated either.
 
 # %% tags=["hide-input"]
 # Left: acceleration over force of the hammer with two resonances. Right: the three levels of the
@@ -283,7 +284,8 @@ figure
 # %%
 as_seen = np.interp(velocity, GAIN * moved, stiffer)
 loss = np.interp(velocity, GAIN * moved, damped)
-# Noise of 0.3 % of a phasor is 0.3 % of the half-width at resonance, about 1e-3 Hz, more off resonance.
+# Noise of 0.3 % of a phasor is 0.3 % of the half-width at resonance, about 1e-3 Hz, more off
+# resonance.
 headline["on the sensor's axis all natural frequencies are within 0.05 %"] = bool(
     np.abs(natural / as_seen - 1).max() < 5e-4
 )

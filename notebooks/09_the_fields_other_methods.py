@@ -58,8 +58,8 @@ headline = {}
 # - *CONCERTO* (Carrella & Ewins 2011): pairs of frequencies of equal amplitude on both sides;
 # - *describing functions* (Arslan & Özgüven 2008), the location of the nonlinear element known;
 # - *response-controlled tests* (Karaağaçlı & Özgüven 2020): modal fits at constant amplitude, and
-#   the *harmonic force surface*. Its authors control amplitudes in the test; here surfaces are interpolated
-#   from levels of constant force, unlike their tests;
+#   the *harmonic force surface*. Its authors control amplitudes in the test; here surfaces are
+#   interpolated from levels of constant force, unlike their tests;
 # - *phase resonance* (Peeters, Kerschen & Golinval 2011): each level's crossing of 0°.
 
 # %% tags=["hide-input"]
@@ -140,7 +140,8 @@ headline |= {
 # armature, with noise on both channels. A stepped sine of one voltage jumps, at different
 # frequencies upwards and downwards. A phase-locked loop (Peter & Leine 2017) follows the
 # backbone, and the response phase by phase around the fold. Control-based continuation (Barton &
-# Sieber) stabilises the unstable part of the S-curve at one frequency by non-invasive velocity feedback.
+# Sieber) stabilises the unstable part of the S-curve at one frequency by non-invasive velocity
+# feedback.
 
 # %%
 modes = sj.model.linear_modes([50 * HERTZ], [0.01], [[1.0]], [1.0])
@@ -390,8 +391,8 @@ headline["ours has the smallest error of frequency for at least five of the seve
 # - **Its bands are not the same everywhere**: those of frequency have lower coverage on the
 #   curved beam at the largest noise, those of damping with a bolted joint. Bands of CONCERTO and
 #   of the modal fits, which exclude the bias of their own model, cover far less.
-# - Where an open loop jumps before resonance, only control loops measure the rest. They cost more test
-#   time per state, and a controller. **Their results are closer to the truth than ours on six
+# - Where an open loop jumps before resonance, only control loops measure the rest. They cost more
+#   test time per state, and a controller. **Their results are closer to the truth than ours on six
 #   structures of seven** (`benchmarks/methods_loops_and_decays.jsonl`), although the noise is not
 #   the same: there it is on samples, of which a loop averages many periods. Only near a second
 #   mode is ours better, which subtracts the contribution of that mode.

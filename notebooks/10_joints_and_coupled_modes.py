@@ -12,8 +12,8 @@
 # %% [markdown]
 # # From one load to another: a bolted joint
 #
-# A steel cantilever has a friction joint between its root and its middle. It was tested with a force
-# at the **tip**; the question is its response to a larger force at **another point**.
+# A steel cantilever has a friction joint between its root and its middle. It was tested with a
+# force at the **tip**; the question is its response to a larger force at **another point**.
 #
 # There are two ways:
 #
@@ -39,10 +39,10 @@ headline = {}
 # %% [markdown]
 # ## The beam, the joint and the test
 #
-# 0.71 m of steel, 50 mm high and 60 mm wide, in fourteen elements; dimensions and stuck stiffness of the
-# joint are similar to the RubBeR rig (Scheel et al. 2020, doi 10.1016/j.jsv.2020.115580). The
-# joint is Segalman's four-parameter Iwan model (2005): 10 MN/m while it sticks, 30 N when all of
-# it slips. The beam has three sensors.
+# 0.71 m of steel, 50 mm high and 60 mm wide, in fourteen elements; dimensions and stuck stiffness
+# of the joint are similar to the RubBeR rig (Scheel et al. 2020, doi 10.1016/j.jsv.2020.115580).
+# The joint is Segalman's four-parameter Iwan model (2005): 10 MN/m while it sticks, 30 N when all
+# of it slips. The beam has three sensors.
 
 # %%
 YOUNG, DENSITY, WIDTH, HEIGHT = 0.6725 * 210e9, 7850, 0.06, 0.05
@@ -171,15 +171,15 @@ headline["one mode: within 8 %, and farther off than the joint"] = all(
 )
 
 # %% [markdown]
-# Both predictions use the location of the force only through the shapes of the beam. One mode is off
-# by a few per cent: as the joint slips, the mode shape changes, and the identification reports it
-# (levels that differ in gain and damping). Higher accuracy requires the location of the joint.
+# Both predictions use the location of the force only through the shapes of the beam. One mode is
+# off by a few per cent: as the joint slips, the mode shape changes, and the identification reports
+# it (levels that differ in gain and damping). Higher accuracy requires the location of the joint.
 #
 # ## Two coupled modes: from data to prediction
 #
-# Two modes at 100 and 103 rad/s share a hardening stiffness. There are two sensors; the force excites
-# both modes. Is one mode enough? `identify` tests this when the sensors show a second mode with
-# more motion than the force alone would cause.
+# Two modes at 100 and 103 rad/s share a hardening stiffness. There are two sensors; the force
+# excites both modes. Is one mode enough? `identify` tests this when the sensors show a second mode
+# with more motion than the force alone would cause.
 
 # %%
 LINEAR = sj.model.linear_modes(

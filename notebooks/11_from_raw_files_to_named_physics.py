@@ -126,8 +126,8 @@ for part in found.located:
 #
 # - a *residual receptance* of −6 µm/N at the drive point gains by far the most. It is not
 #   a nonlinearity: other modes and the rigid-body motion of a free beam have this sign and
-#   magnitude, and a model of one mode neglects them. It is visible without any fit: apparent damping falls along
-#   every level, at the smallest as at the largest;
+#   magnitude, and a model of one mode neglects them. It is visible without any fit: apparent
+#   damping falls along every level, at the smallest as at the largest;
 # - in addition *damping that grows* is needed. With one sensor and no harmonics several laws fit it
 #   equally well. The internal resonance in the best attempt is not credible: the data show no
 #   second mode at all.
@@ -238,8 +238,8 @@ figure
 # - **Whether a level has a common error.** Levels differ in gain, phase, frequency and damping as
 #   the notes state; no error is stated. A repeated level would separate drift from physics.
 # - **The goodness of fit.** Without a stated noise, the residual is taken as noise.
-# - **The modal mass to better than about 10 %**: that is how much the lowest levels of the two tests
-#   differ. Every force and every damping ratio has this error. A known added mass decides.
+# - **The modal mass to better than about 10 %**: that is how much the lowest levels of the two
+#   tests differ. Every force and every damping ratio has this error. A known added mass decides.
 # - **What lies beyond 0.16 m/s.**
 
 # %% tags=["hide-input"]

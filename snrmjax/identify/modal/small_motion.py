@@ -184,8 +184,7 @@ def _halving_accelerates(begins: list[int]) -> bool:
 
 
 def _begins(amplitude: np.ndarray, omega: float, rate: float) -> list[int]:
-    begins = [0]
-    fewest = max(_FEWEST_SAMPLES, _FEWEST_CYCLES * HERTZ / omega * rate)
+    begins, fewest = [0], max(_FEWEST_SAMPLES, _FEWEST_CYCLES * HERTZ / omega * rate)
     for k in range(1, _HALVINGS + 1):
         low = amplitude <= amplitude[0] * 0.5**k
         first = int(np.argmax(low)) if low[-1] else 0
