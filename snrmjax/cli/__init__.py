@@ -84,7 +84,10 @@ _NAMES = {whole_test: "test", import_: "import"}
 
 for _command, _examples in _EXAMPLES.items():
     add_command(
-        *(app, _command, _NAMES.get(_command, _command.__name__), _examples),
+        app,
+        _command,
+        _NAMES.get(_command, _command.__name__),
+        _examples,
         reads_models=_command in _READ_MODELS,
     )
 

@@ -38,7 +38,10 @@ def demo(out: Out) -> None:
         print_line("testing it near resonance, with noise")
         errors = sj.simulate.MeasurementErrors(amplitude=0.005, phase=np.radians(0.3), force=0.002)
         test = sj.phase_resonance_test(
-            *(model, np.linspace(1.0e-3, 1.45e-2, 12).tolist(), 60 * HERTZ, 110 * HERTZ),
+            model,
+            np.linspace(1.0e-3, 1.45e-2, 12).tolist(),
+            60 * HERTZ,
+            110 * HERTZ,
             recording=sj.simulate.Recording(errors=errors, seed=1, keep_harmonics=(3, 5)),
         )
         data = test.steady_states

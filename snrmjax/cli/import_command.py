@@ -67,7 +67,8 @@ def import_(
 
 _RESPONSE = MapKey(
     "channel or column of a response, as CH2:acceleration or CH2:acceleration:g; one per sensor",
-    *("NAME[:KIND[:UNIT]]", None),
+    "NAME[:KIND[:UNIT]]",
+    None,
 )
 
 
@@ -79,7 +80,9 @@ def _field(name: str, key: MapKey) -> tuple[str, Any, Any]:
     kind = tuple[str, ...] if several else type(default)
     least = 0 if kind is int else None
     made = option(
-        *(() if several else default, text, key.metavar or None),
+        () if several else default,
+        text,
+        key.metavar or None,
         panel=key.group,
         least=least,
         choices=key.choices,

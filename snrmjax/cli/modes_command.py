@@ -54,7 +54,8 @@ def modes(
     with staged(out.parent) as folder:
         second = read_modal_sources(stated.with_mass) if stated.with_mass else None
         result = find_linear_modes(
-            *(read_modal_sources(data), stated),
+            read_modal_sources(data),
+            stated,
             with_mass=second,
             interest=interest - 1,
             name=out.stem.replace("_", " "),

@@ -131,7 +131,8 @@ def add_command(
 
     signature = inspect.signature(command)
     effects = inspect.Parameter(
-        *(_EFFECTS, inspect.Parameter.KEYWORD_ONLY),
+        _EFFECTS,
+        inspect.Parameter.KEYWORD_ONLY,
         default=[],
         annotation=Annotated[
             list[Path],
@@ -146,7 +147,8 @@ def add_command(
         ],
     )
     every = inspect.Parameter(
-        *(_ALL, inspect.Parameter.KEYWORD_ONLY),
+        _ALL,
+        inspect.Parameter.KEYWORD_ONLY,
         default=False,
         annotation=Annotated[
             bool,
@@ -214,7 +216,7 @@ def _parameter(of: Any, field: dataclasses.Field) -> inspect.Parameter:
     if get_origin(kind) is tuple:
         kind, default = list[get_args(kind)[0]], []  # type: ignore[misc]
     option = typer.Option(
-        *(flag,),
+        flag,
         help=about.help,
         metavar=about.metavar,
         rich_help_panel=about.panel,
@@ -223,7 +225,8 @@ def _parameter(of: Any, field: dataclasses.Field) -> inspect.Parameter:
         show_default=isinstance(default, float) or bool(default),
     )
     return inspect.Parameter(
-        *(field.name, inspect.Parameter.KEYWORD_ONLY),
+        field.name,
+        inspect.Parameter.KEYWORD_ONLY,
         default=default,
         annotation=Annotated[kind, option],
     )

@@ -109,7 +109,10 @@ def simulate(
         raise ValueError("`--parameter` and `--to` need `--follow`, the kind of event.")
     with staged(out) as folder:
         result = simulate_responses(
-            *(structure, loads, from_hz, to_hz),
+            structure,
+            loads,
+            from_hz,
+            to_hz,
             harmonics=harmonics,
             isolated=isolated,
             follow=[] if follow is None else [follow],

@@ -99,7 +99,8 @@ def run(
     try:
         with _progress(quiet) as progress:
             done = run_study(
-                *(study, out),
+                study,
+                out,
                 processes=stated.processes,
                 scheduler=stated.scheduler,
                 shard=part,
@@ -117,7 +118,9 @@ def run(
 
 with_options(run, StudyOptions)
 add_command(
-    *(study_app, run, "run"),
+    study_app,
+    run,
+    "run",
     (
         "snrmjax study run study.toml --out study.zarr",
         "snrmjax study run study.toml --out study.zarr --shard 3/4",

@@ -109,7 +109,9 @@ def beam_of(stated: BeamDescription) -> Beam:
     left, right = (Support(*(of[f"supports.{s}.{key}"] for key in STIFFNESSES)) for s in SIDES)
     masses = enumerate(stated.masses_at, 1)
     return Beam(
-        *(of[LENGTH], of["section.width_m"], of[THICKNESS]),
+        of[LENGTH],
+        of["section.width_m"],
+        of[THICKNESS],
         rise=rise_of(stated),
         young=of["material.young_pa"],
         density=of["material.density_kg_m3"],

@@ -186,7 +186,7 @@ def _unchecked(basis: ReductionBasis, cases: StaticCases, degree: int) -> Conden
     potential = dataclasses.replace(fitted, coefficient=coefficient)
     by_mode, by_case = (np.full(size, np.nan) for size in cases.force.shape[::-1])
     no_quality = FitQuality(
-        *(np.nan, np.nan, by_mode, by_mode, by_case, by_case, by_mode, np.nan), energy_error=None
+        np.nan, np.nan, by_mode, by_mode, by_case, by_case, by_mode, np.nan, energy_error=None
     )
     return Condensation(basis, cases, potential, no_quality, (), degree)
 

@@ -242,7 +242,13 @@ def _drawn(named: NamedParts, part: str, remainder: Remainder) -> DrawnLaw:
     largest = readings.largest * shape
     std = relative * np.max(np.abs(force)) * np.ones_like(force)
     return DrawnLaw(
-        *(name, ("odd",), (), Argument.DISPLACEMENT, at * shape, force / shape, std / shape),
+        name,
+        ("odd",),
+        (),
+        Argument.DISPLACEMENT,
+        at * shape,
+        force / shape,
+        std / shape,
         largest=largest,
         passing=passing,
     )

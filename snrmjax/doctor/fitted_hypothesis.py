@@ -303,8 +303,15 @@ def checked_states(
         order = np.linspace(0.0, 1.0, len(at))
     level = np.unique(np.asarray(some.level), return_inverse=True)[1]
     test = TestStates(
-        *(level, omega, force, sign * to_mode * (velocity - residual), errors, False),
-        *((abs(constant) or 1.0) * ratio_of_drive, stds, MODAL_MASS),
+        level,
+        omega,
+        force,
+        sign * to_mode * (velocity - residual),
+        errors,
+        False,
+        (abs(constant) or 1.0) * ratio_of_drive,
+        stds,
+        MODAL_MASS,
         linear=linear,
     )
     base = None

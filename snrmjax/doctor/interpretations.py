@@ -83,7 +83,9 @@ OF_SIZES = (
 IN_DEGREES = Meaning(
     "degrees_as_radians",
     lambda v, _: v,
-    *(_UNIT, ImportCorrection(phase_unit="deg"), -float(np.log(_DEGREES))),
+    _UNIT,
+    ImportCorrection(phase_unit="deg"),
+    -float(np.log(_DEGREES)),
 )
 
 

@@ -88,7 +88,10 @@ def structure_of_matrices(
         _check_named(points, named, f"effect {k} of {file}")
     try:
         built = from_matrices(
-            *(matrices["mass"], damping, matrices["stiffness"], points),
+            matrices["mass"],
+            damping,
+            matrices["stiffness"],
+            points,
             force=at or None,
             base=base,
             unbalance=force.number("unbalance_kg_m", POSITIVE)

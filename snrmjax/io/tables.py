@@ -179,7 +179,9 @@ def _read(
         # Without a model, treat the sensors as relative: velocities stay unchanged.
         known = base or BaseMotion("relative")
         data = base_excited_states(
-            *(level, frequency, _phasors(*(columns[name][first_row] for name in BASE))),
+            level,
+            frequency,
+            _phasors(*(columns[name][first_row] for name in BASE)),
             per_sensor(velocity, 0.0),
             sensors=names,
             along=dict(known.along),

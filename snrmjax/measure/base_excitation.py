@@ -71,7 +71,10 @@ def base_excited_states(
             -1j * angle[:, None, None] * np.asarray(orders)
         )
     states = steady_states(
-        *(np.asarray(level), omega, np.abs(load), recorded * np.exp(-1j * angle)[:, None]),
+        np.asarray(level),
+        omega,
+        np.abs(load),
+        recorded * np.exp(-1j * angle)[:, None],
         sensors=tuple(sensors),
         **rotated,
     )

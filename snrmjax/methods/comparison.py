@@ -58,8 +58,11 @@ def snrm(data: SteadyStates, modes: LinearModes) -> MethodResult:
         backbone, notes = as_backbone(joint), joint.notes
     curve = backbone.sampled(_SAMPLES)
     points = points_of_curves(
-        *(curve.velocity, curve.natural_frequency, curve.natural_frequency_std),
-        *(curve.damping_ratio, curve.damping_ratio_std),
+        curve.velocity,
+        curve.natural_frequency,
+        curve.natural_frequency_std,
+        curve.damping_ratio,
+        curve.damping_ratio_std,
     )
     return method_result("snrm", points, data.n_states, notes)
 

@@ -80,9 +80,13 @@ class MethodResult(AbstractResult):
     def points(self) -> list[MethodPoint]:
         """The points one by one."""
         rows = zip(
-            *(self.status, self.level, self.velocity),
-            *(self.natural_frequency, self.natural_frequency_std),
-            *(self.damping_ratio, self.damping_ratio_std),
+            self.status,
+            self.level,
+            self.velocity,
+            self.natural_frequency,
+            self.natural_frequency_std,
+            self.damping_ratio,
+            self.damping_ratio_std,
             strict=True,
         )
         return [

@@ -217,7 +217,11 @@ def read_test_files(
     return TestFiles(
         read_model(models[0]) if models else None,
         models[0].name if models else "",
-        *(tuple(states), tuple(responses), tuple(records), tuple(passed), tuple(notes)),
+        tuple(states),
+        tuple(responses),
+        tuple(records),
+        tuple(passed),
+        tuple(notes),
         tuple((name, lines) for name, lines in texts if lines),
         steps_of_map(maps[0]) if maps else None,
     )

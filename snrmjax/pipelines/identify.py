@@ -171,7 +171,8 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
         )
     fitted = functools.partial(
         fit_jointly,
-        *(data, model),
+        data,
+        model,
         backbone=names[0],
         damping=names[1] if len(names) == 2 else "auto",
         free=[name for several in options.free for name in several.split(",")],
@@ -207,7 +208,13 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
     ends = float(identification.backbone.smallest), float(identification.backbone.largest)
     values = fitted_values(fit, displacement=np.linspace(*ends, BACKBONE_POINTS))
     return IdentifiedTest(
-        *(data, model, options, identification, values, predictions, _each_once(notes)),
+        data,
+        model,
+        options,
+        identification,
+        values,
+        predictions,
+        _each_once(notes),
         joint=details,
     )
 

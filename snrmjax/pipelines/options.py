@@ -270,7 +270,7 @@ class WholeTestOptions:
         panel=FILES,
     )
     drive_point: str | None = option(
-        *(None, "Sensor at the force, for the scale of the mode shapes.", "NAME"), panel=_ANSWERS
+        None, "Sensor at the force, for the scale of the mode shapes.", "NAME", panel=_ANSWERS
     )
     map_file: Path | None = option(
         None,
@@ -334,7 +334,7 @@ class ModesOptions:
     """Options of `modes`."""
 
     reference: str | None = option(
-        *(None, "Reference channel where there are several.", "NAME"), panel="Fit"
+        None, "Reference channel where there are several.", "NAME", panel="Fit"
     )
     level: int | None = option(None, "Level of steady states (default: the lowest).", panel="Fit")
     from_hz: float | None = option(None, "Lower end of the band in Hz.", "HZ")
@@ -345,7 +345,7 @@ class ModesOptions:
         False, "Responses have the convention e^(-iΩt): use their conjugates.", panel="Fit"
     )
     rate: float | None = option(
-        *(None, "Sampling rate in Hz of records whose file has few digits.", "HZ"), panel="Fit"
+        None, "Sampling rate in Hz of records whose file has few digits.", "HZ", panel="Fit"
     )
     poles: str | None = option(
         None, "Natural frequencies in Hz chosen by hand, as 79.0,427.5.", "HZ,…", panel="Fit"

@@ -106,7 +106,8 @@ def predictions_of_fit(
         settings: dict[str, Any] = {
             "largest_amplitude_ratio": reach_of(options),
             "of": new_level(
-                *(fit, force),
+                fit,
+                force,
                 as_recorded=as_recorded,
                 day=_day_of(options),
                 at=options.predict_at,

@@ -137,7 +137,7 @@ def simulate_responses(
     if quasi_periodic:
         tori, torus_notes = _tori(model, curves, ends)
         notes += torus_notes
-    return SimulatedResponses(*(tuple(curves), sensor, tuple(notes), tuple(events), tuple(tori)))
+    return SimulatedResponses(tuple(curves), sensor, tuple(notes), tuple(events), tuple(tori))
 
 
 def _tori(

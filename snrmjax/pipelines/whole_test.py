@@ -146,8 +146,19 @@ def run_whole_test(
     )
     counts = _used_steps(files, stepped)
     return WholeTest(
-        *(name, files, model, modes, records, stepped, counts),
-        *(data, checkup, identified, diagnosed, left_out, notes),
+        name,
+        files,
+        model,
+        modes,
+        records,
+        stepped,
+        counts,
+        data,
+        checkup,
+        identified,
+        diagnosed,
+        left_out,
+        notes,
     )
 
 

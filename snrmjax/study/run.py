@@ -149,8 +149,12 @@ def run_study(
             collect_chunks(ensemble, folder, described)
     return StudyRun(
         folder.out,
-        *(len(ensemble.table), done.failed, done.done - done.done_before),
-        *(missing, len(damaged), time.perf_counter() - begin),
+        len(ensemble.table),
+        done.failed,
+        done.done - done.done_before,
+        missing,
+        len(damaged),
+        time.perf_counter() - begin,
     )
 
 

@@ -202,7 +202,7 @@ def test_an_amplitude_alone_has_no_phase(tmp_path):
     states = reading
     np.testing.assert_array_equal(states.velocity[:, 0], [0.2, 0.3])
     assert np.all(states.phase_unknown)
-    assert any("amplitude of the velocity alone" in str(note) for note in reading.notes)
+    assert any("velocity amplitude only" in str(note) for note in reading.notes)
     assert any("`phase_std_deg`" in str(note) for note in reading.notes)
     # The written file reads back the same.
     write_steady_states(tmp_path / "again.csv", states)

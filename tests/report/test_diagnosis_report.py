@@ -21,7 +21,7 @@ from snrmjax.pipelines.diagnose import DiagnosedTest, simulated_levels
 from snrmjax.report import style as drawing
 from snrmjax.report.figures import diagnosis as plot
 from snrmjax.report.html import report_html
-from snrmjax.report.pages import diagnosis as told
+from snrmjax.report.pages import diagnosis as diagnosis_page
 
 SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 100.0, 0.01
 LARGEST = 0.6  # m/s
@@ -171,15 +171,15 @@ def drag():
 def pictures(drag):
     given, _, found = drag
     simulated = simulated_levels(found, given)
-    responses = told.responses_figure(found, simulated)
-    figures = {**told.diagnosis_figures(found), "responses": responses}
+    responses = diagnosis_page.responses_figure(found, simulated)
+    figures = {**diagnosis_page.diagnosis_figures(found), "responses": responses}
     return simulated.predicted.levels, figures
 
 
 def html_of(found, pictures, **settings):
     predicted, figures = pictures
     pixels = dict.fromkeys(figures, drawing.PrintedFigure(b"PNG", 7.0))  # words are tested here
-    return report_html(told.diagnosis_report(found, "One", pixels, predicted, **settings))
+    return report_html(diagnosis_page.diagnosis_report(found, "One", pixels, predicted, **settings))
 
 
 def test_the_report_begins_with_the_verdict_in_a_sentence(drag, pictures):
@@ -241,15 +241,15 @@ def test_a_parameter_without_an_error_is_said_to_be_undetermined(drag, pictures)
 
 def test_disagreement_is_located_in_words():
     part = Located("damping", (0.0401, 0.161), 0.0, 1.86, 0.11)
-    assert told._located(part) == (
+    assert diagnosis_page._located(part) == (
         "The damping differs from the model's, at velocity amplitudes from 0.0401 to 0.161 m/s; "
         "the change grows as amplitude^(1.86 ± 0.11) (by chance: below 10⁻¹²)."
     )
     # Noise that is stated ten times too small makes the 1σ ten times too small.
-    assert "amplitude^(1.9 ± 1.1)" in told._located(part, 10.0)
+    assert "amplitude^(1.9 ± 1.1)" in diagnosis_page._located(part, 10.0)
     part = Located("not_a_function_of_amplitude", (0.001, 0.02), 2e-7)
-    assert "no function of the amplitude" in told._located(part)
-    assert "from 1 to 20 mm/s (by chance: 2 × 10⁻⁷)" in told._located(part)
+    assert "not a function of amplitude" in diagnosis_page._located(part)
+    assert "from 1 to 20 mm/s (by chance: 2 × 10⁻⁷)" in diagnosis_page._located(part)
 
 
 def test_predictions_of_unseen_levels_are_told_from_those_of_the_completed_model(drag, pictures):
@@ -270,30 +270,30 @@ def test_predictions_of_unseen_levels_are_told_from_those_of_the_completed_model
 def test_the_terminal_has_what_was_found_with_its_error_and_unit(drag):
     given, _, found = drag
     value, std = found.parameters["quadratic_damping.coefficient"]
-    (line,) = (one for one in told.headline(DiagnosedTest(found, given)) if "± 1σ" in one)
+    (line,) = (one for one in diagnosis_page.headline(DiagnosedTest(found, given)) if "± 1σ" in one)
     words = r"identified \(± 1σ\): quadratic damping, coefficient (\S+) ± (\S+) 1/\(√kg m\)"
     printed = re.fullmatch(words, line)
     assert printed
     # To two digits of the error.
     assert [float(text) for text in printed.groups()] == pytest.approx([value, std], rel=0.05)
     poor = dataclasses.replace(found, verdict="unknown", gap=found.gap._replace(after=169.0))
-    (line,) = (one for one in told.headline(DiagnosedTest(poor, given)) if "± 1σ" in one)
+    (line,) = (one for one in diagnosis_page.headline(DiagnosedTest(poor, given)) if "± 1σ" in one)
     assert line.startswith("best attempt (± 1σ): quadratic damping, coefficient")
     assert line.endswith("; the ± holds only if the noise is as stated")
     nothing = dataclasses.replace(found, answer=found.answer._replace(effects=(), candidates=()))
-    assert not any("±" in one for one in told.headline(DiagnosedTest(nothing, given)))
+    assert not any("±" in one for one in diagnosis_page.headline(DiagnosedTest(nothing, given)))
 
 
 def test_a_law_at_a_place_has_physical_units_in_the_terminal(drag):
     given, _, found = drag
     law = LocatedLaw("cubic_stiffness", 1.0, 10, {"coefficient": 2e4}, {"coefficient": 300.0})
     place = LocatedForce("tip", (("tip", 1.0),), 0.9, law, {"cubic_stiffness": 1.0})
-    other = place._replace(name="everywhere", row=None, probability=0.1)
+    other = place._replace(name="everywhere", influence=None, probability=0.1)
     where = Localisation(
         *((place, other), given, None, ("tip", "everywhere"), np.array([0.9, 0.1])), misfit=1.0
     )
     poor = dataclasses.replace(found, verdict=Verdict.UNKNOWN)
-    lines = told.headline(DiagnosedTest(poor, given, where=where))
+    lines = diagnosis_page.headline(DiagnosedTest(poor, given, where=where))
     assert "identified (± 1σ): cubic stiffness at tip, coefficient 20000 ± 300 N/m³" in lines
 
 
@@ -320,25 +320,27 @@ def test_what_these_data_cannot_show_is_said_to_be_so(drag, pictures):
 
 
 def test_gains_of_candidates_have_sensible_digits():
-    assert told._gain(8881703213.0) == "8.9 × 10⁹"
-    assert told._gain(431.6) == "432"
-    assert told._gain(-6.1) == "−6"
+    assert diagnosis_page._gain(8881703213.0) == "8.9 × 10⁹"
+    assert diagnosis_page._gain(431.6) == "432"
+    assert diagnosis_page._gain(-6.1) == "−6"
 
 
 def test_levels_that_hold_the_response_are_told_and_their_states_pale(drag, pictures):
     data = drag[1]
-    assert not told.is_response_controlled(data, pictures[0])
-    assert "hold the response" not in html_of(drag[2], pictures)
+    assert not diagnosis_page.is_response_controlled(data, pictures[0])
+    assert "control the response" not in html_of(drag[2], pictures)
     force = np.asarray(data.force)
     swept = dataclasses.replace(data, force=force * np.linspace(0.7, 1.3, len(force)))
-    assert not told.is_response_controlled(swept, pictures[0])  # its velocities change far more
+    assert not diagnosis_page.is_response_controlled(
+        swept, pictures[0]
+    )  # its velocities change far more
     velocity, level = np.asarray(data.velocity), np.asarray(data.level)
     size = np.abs(velocity[:, 0])
     held = np.array([np.median(size[level == one]) for one in level]) / size
     swept = dataclasses.replace(swept, velocity=velocity * held[:, None])
-    assert told.is_response_controlled(swept, pictures[0])
+    assert diagnosis_page.is_response_controlled(swept, pictures[0])
     html = html_of(dataclasses.replace(drag[2], data=swept), pictures)
-    assert "hold the response" in html
+    assert "control the response" in html
     forces = [one.force for one in pictures[0]]
     assert plot.at_curve_force(data, forces).all()
     assert 0 < plot.at_curve_force(swept, forces).mean() < 0.8

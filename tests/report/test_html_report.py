@@ -264,7 +264,7 @@ def test_headline_numbers_are_those_of_the_curves(identification, modes, data):
 def test_the_result_is_one_sentence(identification, modes):
     sentence = identification_sentence(identification, modes)
     hertz, displacement = frequency_at(np.array([1e-4, 1e-3])) / HERTZ, np.array([1e-4, 1e-3])
-    said = re.fullmatch(
+    match = re.fullmatch(
         rf"From (\S+) to (\S+) m/s at {re.escape(f'tip {NASTY}')}, "
         r"the natural frequency of mode 1 rises from "
         r"(\S+) to (\S+) Hz and its damping ratio falls from (\S+) to (\S+) %\.",
@@ -272,11 +272,11 @@ def test_the_result_is_one_sentence(identification, modes):
     )
     speed = displacement * hertz * HERTZ
     # Three and four digits are printed; the curve is exact to 0.05 %.
-    assert float(said[1]) == pytest.approx(speed[0], rel=6e-3)
-    assert float(said[2]) == pytest.approx(speed[1], rel=6e-3)
-    np.testing.assert_allclose([float(said[3]), float(said[4])], hertz, rtol=1e-3)
+    assert float(match[1]) == pytest.approx(speed[0], rel=6e-3)
+    assert float(match[2]) == pytest.approx(speed[1], rel=6e-3)
+    np.testing.assert_allclose([float(match[3]), float(match[4])], hertz, rtol=1e-3)
     # Constant modal damping: the ratio falls as the frequency rises.
-    np.testing.assert_allclose([float(said[5]), float(said[6])], 160 / hertz, rtol=1e-2)
+    np.testing.assert_allclose([float(match[5]), float(match[6])], 160 / hertz, rtol=1e-2)
 
 
 def test_a_curve_that_turns_tells_its_lowest_and_highest_value(identification, modes):

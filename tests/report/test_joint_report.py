@@ -31,7 +31,7 @@ def fit():
 
 
 @pytest.fixture(scope="module")
-def told(fit):
+def details(fit):
     advice = sj.next_measurements(fit, 3)
     forces = sorted({one.force for one in advice})
     responses = tuple(fitted_response(fit, force)[0] for force in forces)
@@ -39,22 +39,22 @@ def told(fit):
 
 
 @pytest.fixture(scope="module")
-def figures(told):
+def figures(details):
     points = sj.identify.identify_points(noisy(1, gain=0.01), modes())
-    return joint_report.joint_figures(told, points)
+    return joint_report.joint_figures(details, points)
 
 
-def test_the_report_passes_the_amplitude_on(told):
+def test_the_report_passes_the_amplitude_on(details):
     points = sj.identify.identify_points(noisy(1, gain=0.01), modes())
     shown = plot_data.SHOWN_AMPLITUDES["displacement"]
-    figures = joint_report.joint_figures(told, points, shown)
+    figures = joint_report.joint_figures(details, points, shown)
     for name in ("joint_fit", "residuals"):
         assert figures[name].axes[0].get_xlabel().startswith("Displacement amplitude (")
 
 
 @pytest.fixture(scope="module")
-def sections(told, figures):
-    return joint_report.joint_sections(told, figures)
+def sections(details, figures):
+    return joint_report.joint_sections(details, figures)
 
 
 def close_to(text, value, rel=0.0):
@@ -115,14 +115,16 @@ def test_errors_found_are_those_of_the_fit(fit, sections):
     assert rows["natural frequency, from state to state"] == "0 %"
 
 
-def test_bars_of_one_colour_are_the_whole_variance(told, figures):
+def test_bars_of_one_colour_are_the_whole_variance(details, figures):
     (axes,) = figures["contributions"].axes
     bars = {b.get_label(): [patch.get_width() for patch in b] for b in axes.containers}
     assert sum(bars["natural frequency"]) == pytest.approx(100, abs=1e-6)
     assert sum(bars["damping"]) == pytest.approx(100, abs=1e-6)
     names = [text.get_text() for text in axes.get_yticklabels()]
     # Five levels' gains are one bar.
-    gains = sum(s.damping_fraction for s in told.fractions if s.source.startswith("gain of level"))
+    gains = sum(
+        s.damping_fraction for s in details.fractions if s.source.startswith("gain of level")
+    )
     assert bars["damping"][names.index("gain of levels")] == pytest.approx(100 * gains)
     assert axes.yaxis_inverted()
 
@@ -137,7 +139,7 @@ def test_small_contributions_share_a_bar():
     np.testing.assert_allclose(widths, [[99.5, 0.5], [99.8, 0.2]], rtol=1e-12)
 
 
-def test_the_table_of_contributions_sums_to_one_hundred(told, sections):
+def test_the_table_of_contributions_sums_to_one_hundred(details, sections):
     rows = sections[1].tables[0].rows
     for column in (1, 2):
         # Each row is rounded to 0.05.
@@ -217,25 +219,25 @@ def test_residuals_are_drawn_and_counted(fit, figures):
     assert plot_data.fit_residuals(fit).level.min() == 1
 
 
-def test_advised_states_are_marked_and_listed(told, figures, sections):
+def test_advised_states_are_marked_and_listed(details, figures, sections):
     speeds, phases = figures["next"].axes
     marks = [line for line in speeds.lines if line.get_marker() == "o"]
-    assert len(marks) == len(told.advice) == 3
-    for mark, one in zip(marks, told.advice, strict=True):
+    assert len(marks) == len(details.advice) == 3
+    for mark, one in zip(marks, details.advice, strict=True):
         assert mark.get_xdata() == pytest.approx(one.frequency / HERTZ)
-    said = ", ".join(text.get_text() for text in speeds.texts)
-    assert sorted(said.split(", ")) == ["1", "2", "3"]
+    labels = ", ".join(text.get_text() for text in speeds.texts)
+    assert sorted(labels.split(", ")) == ["1", "2", "3"]
     turned = [line.get_ydata() for line in phases.lines if line.get_marker() == "o"]
-    np.testing.assert_allclose(np.ravel(turned), [a.phase / DEGREE for a in told.advice])
+    np.testing.assert_allclose(np.ravel(turned), [a.phase / DEGREE for a in details.advice])
     rows = sections[2].tables[0].rows
-    assert [row[-1] for row in rows] == [str(one.reason) for one in told.advice]
-    close_to(rows[0][2], told.advice[0].frequency / HERTZ)
+    assert [row[-1] for row in rows] == [str(one.reason) for one in details.advice]
+    close_to(rows[0][2], details.advice[0].frequency / HERTZ)
 
 
-def test_states_that_lie_together_share_a_label(told):
-    first = told.advice[0]
+def test_states_that_lie_together_share_a_label(details):
+    first = details.advice[0]
     advice = [first, first._replace(rank=2, frequency=1.001 * first.frequency)]
-    figure = joint_plot.next_measurements_figure(told.responses, advice, sensor="tip")
+    figure = joint_plot.next_measurements_figure(details.responses, advice, sensor="tip")
     assert [text.get_text() for text in figure.axes[0].texts] == ["1, 2"]
 
 

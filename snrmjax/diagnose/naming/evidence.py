@@ -72,14 +72,12 @@ class LawSums(NamedTuple):
         odds = {kind: odds_of(kind) for kind in dict.fromkeys(kinds)}
         every = sum(odds.values())
         return cls(
-            *(
-                remainder_std,
-                levels[0],
-                base + _log_prior(remainder_std) + levels[1],
-                gram[:-1, -1],
-                gram[:-1, :-1],
-                np.array(kinds),
-            ),
+            remainder_std,
+            levels[0],
+            base + _log_prior(remainder_std) + levels[1],
+            gram[:-1, -1],
+            gram[:-1, :-1],
+            np.array(kinds),
             np.array([column.sign for column in columns]),
             np.array([np.nan if c.std is None else c.std for c in columns]),
             np.array([odds[c.kind] / every * c.fraction for c in columns]),

@@ -150,7 +150,7 @@ def _resonance(order: int) -> Change:
     def change(r: Readings, detuning: float, log_times: float) -> np.ndarray:
         ratio = np.exp(log_times) * max(r.damping_ratio, 1e-4)
         return describing.resonant(
-            *(r.relative_amplitude, r.relative_frequency, order, detuning, ratio)
+            r.relative_amplitude, r.relative_frequency, order, detuning, ratio
         )
 
     return change
@@ -206,15 +206,18 @@ LAWS: dict[str, Law] = {
         _stiffness(0), parameters=lambda r, s: (float(np.sqrt(max(1 + s, 0.0))) - 1,)
     ),
     CubicStiffness.kind: Law(
-        *(_stiffness(2), _of_force(lambda q, _: 4 / 3 * q**3)),
+        _stiffness(2),
+        _of_force(lambda q, _: 4 / 3 * q**3),
         parameters=lambda r, s: (s * r.natural_frequency**2 / (0.75 * r.largest**2),),
     ),
     QuinticStiffness.kind: Law(
-        *(_stiffness(4), _of_force(lambda q, _: 1.6 * q**5)),
+        _stiffness(4),
+        _of_force(lambda q, _: 1.6 * q**5),
         parameters=lambda r, s: (s * r.natural_frequency**2 / (0.625 * r.largest**4),),
     ),
     QuadraticStiffness.kind: Law(
-        *(lambda r, log_s, _: _quadratic(r, log_s)[0], _second_of(_quadratic)),
+        lambda r, log_s, _: _quadratic(r, log_s)[0],
+        _second_of(_quadratic),
         axes=(_QUADRATICS,),
         choices=(1.0, -1.0),
         sign=1,
@@ -223,7 +226,8 @@ LAWS: dict[str, Law] = {
         ),
     ),
     BilinearStiffness.kind: Law(
-        *(lambda r, log_k, _: _bilinear(r, log_k)[0], _second_of(_bilinear)),
+        lambda r, log_k, _: _bilinear(r, log_k)[0],
+        _second_of(_bilinear),
         axes=(_BILINEARS,),
         choices=(1.0, -1.0),
         sign=-1,
@@ -247,20 +251,24 @@ LAWS: dict[str, Law] = {
     ),
     LinearDampingChange.kind: Law(_damping(0, 1), parameters=lambda r, s: (s / 2,)),
     QuadraticDamping.kind: Law(
-        *(_damping(1, 2), _of_force(lambda _, v: 3 * np.pi / 8 * v * np.abs(v))),
+        _damping(1, 2),
+        _of_force(lambda _, v: 3 * np.pi / 8 * v * np.abs(v)),
         sign=1,
         parameters=lambda r, s: (s * 3 * np.pi / (8 * r.largest),),
     ),
     CubicDamping.kind: Law(
-        *(_damping(2, 3), _of_force(lambda _, v: 4 / 3 * v**3)),
+        _damping(2, 3),
+        _of_force(lambda _, v: 4 / 3 * v**3),
         parameters=lambda r, s: (s / (0.75 * r.largest**2 * r.natural_frequency),),
     ),
     VanDerPolDamping.kind: Law(
-        *(_damping(2, 1), _of_force(lambda q, v: 4 * q**2 * v)),
+        _damping(2, 1),
+        _of_force(lambda q, v: 4 * q**2 * v),
         parameters=lambda r, s: (4 * s * r.natural_frequency / r.largest**2,),
     ),
     CoulombFriction.kind: Law(
-        *(_damping(-1, 0), _of_force(lambda _, v: np.pi / 4 * np.sign(v))),
+        _damping(-1, 0),
+        _of_force(lambda _, v: np.pi / 4 * np.sign(v)),
         sign=1,
         parameters=lambda r, s: (s * r.natural_frequency**2 * np.pi * r.largest / 4,),
     ),
@@ -275,18 +283,24 @@ LAWS: dict[str, Law] = {
         ),
     ),
     IwanMicroslip.kind: Law(
-        *(_iwan, _of_force(describing.microslip), (_EXPONENTS,)),
+        _iwan,
+        _of_force(describing.microslip),
+        (_EXPONENTS,),
         sign=1,
         parameters=lambda r, s, p: (s * r.natural_frequency**2 / r.largest ** (p - 1), p),
     ),
     InternalResonanceOneToTwo.kind: Law(
-        *(_resonance(2), _third_of_resonance(2), (_DETUNINGS, _DAMPINGS)),
+        _resonance(2),
+        _third_of_resonance(2),
+        (_DETUNINGS, _DAMPINGS),
         sign=1,
         odds=priors.RESONANCE,
         parameters=_of_resonance(2),
     ),
     InternalResonanceOneToThree.kind: Law(
-        *(_resonance(3), _third_of_resonance(3), (_DETUNINGS, _DAMPINGS)),
+        _resonance(3),
+        _third_of_resonance(3),
+        (_DETUNINGS, _DAMPINGS),
         sign=1,
         odds=priors.RESONANCE,
         parameters=_of_resonance(3),
@@ -298,7 +312,8 @@ LAWS: dict[str, Law] = {
         parameters=lambda r, s: (s * priors.ADDED_MASS,),
     ),
     ForceHarmonics.kind: Law(
-        *(lambda r, _: np.zeros_like(r.dynamic_stiffness), _forced),
+        lambda r, _: np.zeros_like(r.dynamic_stiffness),
+        _forced,
         choices=(2.0, 3.0),
         parameters=lambda r, s, order: (s * (order == 2), s * (order == 3)),
         **_INSTRUMENT,

@@ -124,7 +124,10 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
         parts[k] = parts[k]._replace(verdict="drawn")
     linear, (stiffness_error, damping_error) = problem.readings.linear, best.solved.linear
     return Naming(
-        *(tuple(parts), answers, _parameters(problem, best, wanted), best.solved.misfit),
+        tuple(parts),
+        answers,
+        _parameters(problem, best, wanted),
+        best.solved.misfit,
         of_fundamentals=best.solved.of_fundamentals,
         cell=best.cell,
         natural_frequency=linear.natural_frequency + stiffness_error * linear.frequency_std,
@@ -384,7 +387,12 @@ def _remainder(problem: Problem, assessed: list[Assessed], part: str, best: Asse
         laws = np.abs(laws)
     probability = sum(one.weight for one in assessed if one.left[part])
     return Remainder(
-        *(velocity, unit * value, unit * laws, unit * std, readings.amplitude * natural, beyond),
+        velocity,
+        unit * value,
+        unit * laws,
+        unit * std,
+        readings.amplitude * natural,
+        beyond,
         rms=_rms(unit_of_state * change.left),
         significant=probability > 0.5,
     )

@@ -158,7 +158,10 @@ def readings_of(
     )
     states = posterior.states
     balance = Balance(
-        *(states, posterior.terms, posterior.layout, posterior.weight),
+        states,
+        posterior.terms,
+        posterior.layout,
+        posterior.weight,
         np.zeros((len(states.level), 0), complex),
     )
     now, omega = balance.at(posterior.mean, posterior.corrections), states.frequency
@@ -192,8 +195,19 @@ def readings_of(
         columns.append(std_off * now.with_frequency[:, k])
     none, slope = np.empty(0), now.slope
     bare = Readings(
-        *(linear, now.velocity, omega, now.force, order, now.z, slope, root, rows, none, none),
-        *(of_level, level_stds),
+        linear,
+        now.velocity,
+        omega,
+        now.force,
+        order,
+        now.z,
+        slope,
+        root,
+        rows,
+        none,
+        none,
+        of_level,
+        level_stds,
         posterior=posterior,
     )
     higher = () if recorded is None else _higher(linear, states, now.velocity, motion, recorded)

@@ -85,7 +85,9 @@ def state_motion(
     """The equations of one state with a prescribed velocity (m/s) of the reference sensor."""
     return prescribed_motion(
         eqx.tree_at(lambda m: m.test_order, model, state.order),
-        *(state.frequency, state.force, velocity),
+        state.frequency,
+        state.force,
+        velocity,
         sensor=sensor,
         harmonic_order=harmonic_order,
         scale=jnp.abs(state.velocity[0]),

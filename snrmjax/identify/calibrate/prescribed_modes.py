@@ -195,7 +195,8 @@ def prescribed_mode_motion(
     scale = amplitude / (state.frequency * jnp.abs(modes.mode_shape[prescribed.sensors[0], j]))
     balance = harmonic_balance(
         simulated_structure(eqx.tree_at(lambda m: m.test_order, model, state.order)),
-        *(force, jax.lax.stop_gradient(scale)),
+        force,
+        jax.lax.stop_gradient(scale),
         harmonic_order=harmonic_order,
     )
     load = jnp.abs(modes.participation[j]) * state.force

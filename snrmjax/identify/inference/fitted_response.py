@@ -107,7 +107,9 @@ def fitted_response(
     modes = level.modes(fit)
     interpolated = as_backbone(fit, reach=largest_amplitude_ratio).moved_by(level.over_test(fit))
     curves = predict_response(
-        *(interpolated, modes, force),
+        interpolated,
+        modes,
+        force,
         from_frequency=from_frequency,
         to_frequency=to_frequency,
         largest_amplitude_ratio=largest_amplitude_ratio,
@@ -193,9 +195,11 @@ def predicted_resonance(
     if not is_single(modes):
         load = load * np.asarray(sensed_mode(modes, natural).ratio)
     return resonance_distribution(
-        *(force, amplitude),
+        force,
+        amplitude,
         KnownCurves(values, slopes @ root, constant * load, by_load),
-        *(new, other_modes(modes, fit.data.sensor, force)),
+        new,
+        other_modes(modes, fit.data.sensor, force),
         ratio=largest_amplitude_ratio,
         gain_of_force=bool(fit.prior.gain_of_force > 0),
         self_excited=self_excited,

@@ -130,7 +130,9 @@ def banded_curve(
     # The points come from interpolated curves: Newton steps move them onto the fit's own.
     return by_blocks(
         lambda x, omega: _bands(motion, vector, covariance, x, omega, count),
-        *(_BLOCK, np.asarray(amplitude), np.asarray(frequency)),
+        _BLOCK,
+        np.asarray(amplitude),
+        np.asarray(frequency),
     )
 
 

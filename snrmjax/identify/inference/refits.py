@@ -48,9 +48,7 @@ class FitInputs(eqx.Module):
         """No change."""
         states, modes = jnp.zeros(len(fit.data.level)), jnp.zeros(fit.modes.n_modes)
         linear, four = jnp.zeros(len(fit.prior.linear)), jnp.zeros(4)
-        return cls(
-            *(states, states, states, modes, modes, modes), *(four, four, linear, jnp.zeros(2))
-        )
+        return cls(states, states, states, modes, modes, modes, four, four, linear, jnp.zeros(2))
 
 
 class _Refit(eqx.Module):

@@ -277,7 +277,7 @@ def scale_modes(
     of_participation = np.einsum("ki,kij,kj->k", slopes, covariance, slopes)
     relative = of_participation + scaled.relative_std**2 + (chain * (1 - scaled.exponent)) ** 2
     rigid = rigid_body_mode(
-        *(fit, gain, None if free is None else free.mass or 0.0), *(_drive_point_of(fit), scaled.by)
+        fit, gain, None if free is None else free.mass or 0.0, _drive_point_of(fit), scaled.by
     )
     volts = (Fact("participations_per_volt"),) if per == "V" else ()
     return ScaledModes(

@@ -335,7 +335,10 @@ def _with_parts_of_noise(
     posterior, parts = fit(first, rounds=rounds), StateNoise(0.0, 0.0, 1.0)
     for _ in range(_NOISE_ROUNDS):
         balance = Balance(
-            *(states, posterior.terms, posterior.layout, posterior.weight),
+            states,
+            posterior.terms,
+            posterior.layout,
+            posterior.weight,
             np.zeros((len(states.level), 0), complex),
         )
         last = parts

@@ -73,8 +73,12 @@ class JointDensity(NamedTuple):
                 constant -= np.log(pair[1]) + _LOG_ROOT
         first, second = (np.array(rows).reshape(-1, k) for rows, k in ((normal, 3), (half, 2)))
         return cls(
-            *(first[:, 0].astype(int), first[:, 1], first[:, 2]),
-            *(second[:, 0].astype(int), second[:, 1], float(constant)),
+            first[:, 0].astype(int),
+            first[:, 1],
+            first[:, 2],
+            second[:, 0].astype(int),
+            second[:, 1],
+            float(constant),
         )
 
     def log_density(

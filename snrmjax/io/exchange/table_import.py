@@ -135,13 +135,12 @@ def import_table(
     good = np.isfinite(omega) & np.isfinite(force_phasor) & np.isfinite(phasors).any(axis=1)
     _check(omega[good], np.abs(force_phasor[good]), file)
     part = MeasuredPart(
-        *(
-            omega[good],
-            np.abs(force_phasor[good]),
-            phasors[good],
-            None if key is None else key[good],
-        ),
-        *(amplitude_std[good], phase_std[good]),
+        omega[good],
+        np.abs(force_phasor[good]),
+        phasors[good],
+        None if key is None else key[good],
+        amplitude_std[good],
+        phase_std[good],
     )
     left_out = int(np.sum(~good))
     notes += [Fact("rows_incomplete", n=left_out, of=len(good), file=file)] if left_out else []

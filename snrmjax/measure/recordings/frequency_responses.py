@@ -121,7 +121,11 @@ def frequency_responses(
         [channel.calibration for channel in inputs]
     )
     return FrequencyResponses(
-        *(outputs, inputs, omega, numbers * scale[:, :, None], known),
+        outputs,
+        inputs,
+        omega,
+        numbers * scale[:, :, None],
+        known,
         averages,
         name,
         tuple(notes),

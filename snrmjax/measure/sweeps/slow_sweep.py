@@ -174,8 +174,14 @@ class _Reader(NamedTuple):
         sample = float(np.interp(goal, ordered, part.middle))
         names = (self.chosen.force.name, *(channel.name for channel in self.chosen.responses))
         return swept_phasors(
-            *(self.recording, names, part, self.phase[rows]),
-            *(omega, sample, self.cycles, self.highest),
+            self.recording,
+            names,
+            part,
+            self.phase[rows],
+            omega,
+            sample,
+            self.cycles,
+            self.highest,
         )
 
     def along(

@@ -135,7 +135,10 @@ def restoring_force(
     without 1σ, which the method does not give; its note states the misfit.
     """
     fitted = fit_restoring_force(
-        *(time, velocity, force, modes),
+        time,
+        velocity,
+        force,
+        modes,
         degree=degree,
         least_amplitude=least_amplitude,
         most_left=most_left,

@@ -42,7 +42,8 @@ def phase_locked_loop(
     0.005 % of the frequency after 300 cycles at a large step with v|v| damping, none after 900.
     """
     motions, _, seconds = locked_motions(
-        *(laboratory, [(float(voltage), 0.0) for voltage in positive("voltages", voltages)]),
+        laboratory,
+        [(float(voltage), 0.0) for voltage in positive("voltages", voltages)],
         gains=gains,
         settle_cycles=settle_cycles,
         record_cycles=record_cycles,
@@ -54,8 +55,13 @@ def phase_locked_loop(
         damping = per_force * (motion.force / motion.velocity).real
         ratio = damping / (2 * motion.frequency)
         return MethodPoint(
-            *(MethodStatus.FOUND, level, abs(motion.velocity)),
-            *(motion.frequency, motion.frequency_std, ratio, ratio * motion.ratio_std),
+            MethodStatus.FOUND,
+            level,
+            abs(motion.velocity),
+            motion.frequency,
+            motion.frequency_std,
+            ratio,
+            ratio * motion.ratio_std,
         )
 
     return method_result("pll", _points(motions, point), len(motions), test_seconds=seconds)
@@ -92,8 +98,13 @@ def control_based_continuation(
         natural = float(np.sqrt(motion.frequency**2 - motion.frequency * balance.imag))
         error = abs(balance) * motion.ratio_std
         return MethodPoint(
-            *(MethodStatus.FOUND, level, abs(motion.velocity), natural, error / 2),
-            *(balance.real / (2 * natural), error / (2 * natural)),
+            MethodStatus.FOUND,
+            level,
+            abs(motion.velocity),
+            natural,
+            error / 2,
+            balance.real / (2 * natural),
+            error / (2 * natural),
         )
 
     return method_result("cbc", _points(motions, point), len(motions), test_seconds=bench.seconds)

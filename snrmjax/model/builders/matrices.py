@@ -130,7 +130,10 @@ def from_matrices(
     other = {names[i]: shapes[i] for i in without_sensor}
     participation = load @ shapes
     modes = linear_modes(
-        *(omega, ratio, shapes[with_sensor], participation.real),
+        omega,
+        ratio,
+        shapes[with_sensor],
+        participation.real,
         sensors=measured,
         mode_of_interest=mode_of_interest,
         rigid_body=RigidBodyModes(rigid[with_sensor], (load @ rigid).real),

@@ -61,7 +61,7 @@ class VanDerPolDamping(AbstractMemoryless):
         "strain; below zero, a self-excitation."
     )
     shape: ClassVar[Shape] = Shape(
-        *(Part.DAMPING, Symmetry.ODD, Argument.BOTH), power=2, factor=0.25, frequency_power=1
+        Part.DAMPING, Symmetry.ODD, Argument.BOTH, power=2, factor=0.25, frequency_power=1
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg m² s)", "damping per squared displacement")

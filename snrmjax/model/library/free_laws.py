@@ -209,10 +209,10 @@ class SlipLaw(AbstractLaw, AbstractSliders):
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
     slip_displacement: Knots = parameter(
-        *("kg^1/2 m", "displacement at slip"), rules=(POSITIVE,), entries=Entries.KNOTS
+        "kg^1/2 m", "displacement at slip", rules=(POSITIVE,), entries=Entries.KNOTS
     )
     stiffness: Knots = parameter(
-        *("1/s²", "stiffness while it sticks"), rules=(NOT_NEGATIVE,), entries=Entries.VALUES
+        "1/s²", "stiffness while it sticks", rules=(NOT_NEGATIVE,), entries=Entries.VALUES
     )
 
     def sliders(self) -> Sliders:

@@ -187,7 +187,8 @@ class JenkinsSlider(AbstractSliders):
         "1/s²", "stiffness while it sticks", rules=(NOT_NEGATIVE,), prior=NON_NEGATIVE
     )
     slip_displacement: Scalar = parameter(
-        *("kg^1/2 m", "displacement at slip"),
+        "kg^1/2 m",
+        "displacement at slip",
         rules=(POSITIVE,),
         prior=Prior(1e-3, 1.2, lambda scales: scales.largest),
     )
@@ -222,13 +223,15 @@ class IwanMicroslip(AbstractSliders):
     )
     shape: ClassVar[Shape] = _SLIP
     coefficient: Scalar = parameter(
-        *("(kg^1/2 m)^(1-exponent)/s²", "stiffness lost by slip at unit amplitude"),
+        "(kg^1/2 m)^(1-exponent)/s²",
+        "stiffness lost by slip at unit amplitude",
         rules=(NOT_NEGATIVE,),
         prior=NON_NEGATIVE,
         exponent="exponent",
     )
     exponent: Scalar = parameter(
-        *("1", "power of the backbone's amplitude"),
+        "1",
+        "power of the backbone's amplitude",
         rules=(BETWEEN_ONE_AND_THREE,),
         prior=Prior(1.02, 2.98),
         typical=1.5,
@@ -319,7 +322,7 @@ class CoulombFriction(AbstractHysteresis):
         "small amplitudes."
     )
     shape: ClassVar[Shape] = Shape(
-        *(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY), power=-1, factor=4 / np.pi
+        Part.DAMPING, Symmetry.ODD, Argument.VELOCITY, power=-1, factor=4 / np.pi
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (FRICTION_OR_FORCE_OFFSET,)
     force: Scalar = parameter(

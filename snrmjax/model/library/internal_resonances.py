@@ -41,7 +41,8 @@ class AbstractInternalResonance(AbstractAddedMode):
         "Hz", "natural frequency of the added mode", rules=OF_A_FREQUENCY
     )
     damping_ratio: Scalar = parameter(
-        *("1", "damping ratio of the added mode"),
+        "1",
+        "damping ratio of the added mode",
         rules=OF_A_DAMPING_RATIO,
         prior=ADDED_MODE_DAMPING,
     )

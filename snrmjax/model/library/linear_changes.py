@@ -82,7 +82,8 @@ class LinearDampingChange(AbstractLinearChange):
     description: ClassVar[str] = "The linear damping differs from the model's."
     shape: ClassVar[Shape] = Shape(Part.DAMPING, power=0)
     damping_ratio_change: Scalar = parameter(
-        *("1", "change of the damping ratio"),
+        "1",
+        "change of the damping ratio",
         start=lambda scales: 0.5 * scales.change / scales.frequency**2,
     )
 
@@ -103,7 +104,8 @@ class AddedMass(AbstractLinearChange):
     confounders: ClassVar[tuple[Confounder, ...]] = (STIFFNESS_OR_MASS,)
     like_force_gain: ClassVar[bool] = True
     mass: Scalar = parameter(
-        *("1", "mass over the modal mass"),
+        "1",
+        "mass over the modal mass",
         rules=(ABOVE_MINUS_ONE,),
         prior=POSITIVE_FACTOR,
         start=lambda scales: scales.change / scales.frequency**2,

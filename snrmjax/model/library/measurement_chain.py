@@ -77,7 +77,7 @@ class ForceGainError(AbstractMeasurementEffect):
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE, FORCE_OR_SENSOR_GAIN)
     like_force_gain: ClassVar[bool] = True
-    gain: Scalar = parameter(*("1", "relative error of the force"), **_RELATIVE)
+    gain: Scalar = parameter("1", "relative error of the force", **_RELATIVE)
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -95,7 +95,8 @@ class ForceOffsetError(AbstractMeasurementEffect):
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (FRICTION_OR_FORCE_OFFSET,)
     offset: Scalar = parameter(
-        *("N", "true minus recorded amplitude of the force"),
+        "N",
+        "true minus recorded amplitude of the force",
         start=lambda scales: VISIBLE_CHANGE * scales.smallest_force,
     )
 
@@ -115,7 +116,7 @@ class SensorGainError(AbstractMeasurementEffect):
     )
     confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE, FORCE_OR_SENSOR_GAIN)
     like_force_gain: ClassVar[bool] = True
-    gain: Scalar = parameter(*("1", "relative error of the velocity"), **_RELATIVE)
+    gain: Scalar = parameter("1", "relative error of the velocity", **_RELATIVE)
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -137,7 +138,8 @@ class SensorPhaseError(AbstractMeasurementEffect):
     confounders: ClassVar[tuple[Confounder, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
     only_phase: ClassVar[bool] = True
     phase_deg: Scalar = parameter(
-        *("°", "phase by which the recorded velocity leads"),
+        "°",
+        "phase by which the recorded velocity leads",
         start=lambda _: VISIBLE_CHANGE / DEGREE,
     )
 
@@ -163,7 +165,8 @@ class ResidualMode(AbstractMeasurementEffect):
     follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
     receptance: Scalar = parameter(
-        *("m/N", "displacement of the distant modes over the force"),
+        "m/N",
+        "displacement of the distant modes over the force",
         start=lambda scales: VISIBLE_CHANGE * scales.receptance,
     )
 
@@ -193,12 +196,13 @@ class CloseMode(AbstractMeasurementEffect):
     stage: ClassVar[int] = 1
     modal_constant: Scalar = parameter("1/kg", "product of its shapes at sensor and force")
     frequency_hz: Scalar = parameter(
-        *("Hz", "its natural frequency"),
+        "Hz",
+        "its natural frequency",
         rules=OF_A_FREQUENCY,
         prior=Prior(1 - 2 * _WIDE, 1 + 2 * _WIDE, lambda scales: scales.frequency / HERTZ),
     )
     damping_ratio: Scalar = parameter(
-        *("1", "its damping ratio"), rules=OF_A_DAMPING_RATIO, prior=ADDED_MODE_DAMPING
+        "1", "its damping ratio", rules=OF_A_DAMPING_RATIO, prior=ADDED_MODE_DAMPING
     )
 
     @classmethod
@@ -245,7 +249,8 @@ class ModeShapeChange(AbstractMeasurementEffect):
     confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE,)
     stage: ClassVar[int] = 0
     coefficient: Scalar = parameter(
-        *("1/(kg m²)", "relative change per squared amplitude"),
+        "1/(kg m²)",
+        "relative change per squared amplitude",
         start=lambda scales: VISIBLE_CHANGE / scales.amplitude**2,
     )
 

@@ -194,7 +194,12 @@ class CurveTracer(eqx.Module):
         """The initial state: `start` is a guess, corrected at its own λ or across `across`."""
         unset = jnp.array(0)
         return Tracing(
-            *(start, direction, start, direction, start, direction),
+            start,
+            direction,
+            start,
+            direction,
+            start,
+            direction,
             trial=Trial.at(start, _at_lambda(start) if across is None else across),
             n_points=unset,
             step=jnp.minimum(jnp.asarray(self.control.first), self.control.largest),

@@ -131,7 +131,7 @@ def motions_at(
     starts[:, -1] = end / np.asarray(balances.frequency_scale)[index]
     one = dataclasses.replace(steps, max_points=2)
     curves = trace_from_rest(
-        *(balances, index, np.array([end, end]), one, lanes), downward=False, starts=starts
+        balances, index, np.array([end, end]), one, lanes, downward=False, starts=starts
     )
     nothing = np.full(balances.size + 1, np.nan)
     return np.array([one.points[0] if len(one.points) else nothing for one in curves]).reshape(

@@ -156,7 +156,12 @@ def friction_along(model: Structure, coefficients: Array, frequency: Array) -> F
     at_first, onsets, ends = (jnp.concatenate(part, axis=1) for part in zip(*slip, strict=True))
     events = (jnp.moveaxis(part, 2, 0) - reversal[:, None] for part in (onsets, ends))
     return Friction(
-        *(tau[largest] + reversal, stuck, viscous, internal, attachments, np.array(owner)),
+        tau[largest] + reversal,
+        stuck,
+        viscous,
+        internal,
+        attachments,
+        np.array(owner),
         jnp.concatenate(stiffness, axis=1),
         Slip(at_first, *events),
     )

@@ -75,8 +75,12 @@ def _turning_points(
         end = search.ended(wanted)
         crossing, curvature = _unfolding(equations, end.last.point)
         return _TurningPoint(
-            *(end.last.point, end.resolved & wanted, end.missed & wanted),
-            *(end.last.tangent[equations.balance.size], crossing, curvature),
+            end.last.point,
+            end.resolved & wanted,
+            end.missed & wanted,
+            end.last.tangent[equations.balance.size],
+            crossing,
+            curvature,
         )
 
     return mapped(locate, here, tangent, there, wanted)

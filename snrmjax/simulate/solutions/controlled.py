@@ -206,7 +206,9 @@ def phase_controlled(
         n_samples=n_samples,
     )
     equations = EventEquations(
-        *(model, balance, jnp.asarray(float(largest_force))),
+        model,
+        balance,
+        jnp.asarray(float(largest_force)),
         kind="phase_resonance",
         parameter=FORCE,
     )

@@ -258,7 +258,9 @@ def _problem(
     largest = max(load, upper) if parameter == FORCE else load
     scale = max(resonance_displacement(expanded, largest), float(np.abs(coefficients).max()))
     balance = harmonic_balance(
-        *(expanded, load, scale),
+        expanded,
+        load,
+        scale,
         harmonic_order=(len(coefficients) - 1) // 2,
         n_samples=n_samples,
     )

@@ -264,7 +264,7 @@ def _chunk_of_curves(
     for i, (k, one) in enumerate(zip(good, from_rest, strict=True)):
         folds = _left_folds(results[k], ends)
         if folds:
-            new = curves_where_sweeps_land(*(balances, i, one.curves, folds, ends, settings.steps))
+            new = curves_where_sweeps_land(balances, i, one.curves, folds, ends, settings.steps)
             own = taken(balances, np.full(len(new), i))
             landed = assembled(own, new, settings.steps, branch=Branch.LANDING) if new else []
             results[k] += [curve for curve in landed if np.any(curve.is_stable)]

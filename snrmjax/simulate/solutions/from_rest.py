@@ -133,7 +133,7 @@ def _from_end(
         if np.isfinite(starts[j]).all() and not _passes(curves[i], starts[j])
     ]
     again = trace_from_rest(
-        *(balances, index[far][new], *settings), downward=downward, starts=starts[new]
+        balances, index[far][new], *settings, downward=downward, starts=starts[new]
     )
     for j, curve in zip(new, again, strict=True):
         if len(curve.points):
@@ -255,7 +255,7 @@ def _add_from_beyond(
     away = farthest * np.sqrt(min(np.min(others, initial=2 * farthest) / farthest, 2.0))
     begin = end * away if downward else end / away
     outside = trace_from_rest(
-        *(balances, np.array(owners), np.sort([begin, end]), steps, lanes), downward=downward
+        balances, np.array(owners), np.sort([begin, end]), steps, lanes, downward=downward
     )
     starts = np.full((len(owners), balances.size + 1), np.nan)
     for start, curve in zip(starts, outside, strict=True):
@@ -286,7 +286,7 @@ def _add(
     new = [i for i, k in enumerate(owners) if is_new(k, starts[i])]
     index = np.array(owners, dtype=int)[new]
     curves = trace_from_rest(
-        *(balances, index, ends, steps, lanes), downward=downward, starts=starts[new]
+        balances, index, ends, steps, lanes, downward=downward, starts=starts[new]
     )
     for k, curve in zip(index.tolist(), curves, strict=True):
         if len(curve.points) and is_new(k, curve.points[0]):

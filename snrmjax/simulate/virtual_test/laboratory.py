@@ -279,7 +279,12 @@ def _run(
             seen = channels(motion, voltage)
         largest = jnp.maximum(state.largest, jnp.abs(motion.displacement[j]))
         after = LabState(
-            *(motion, control, state.time + period, known[1:], seen, filtered),
+            motion,
+            control,
+            state.time + period,
+            known[1:],
+            seen,
+            filtered,
             largest,
         )
         return after, (state.time, voltage, force, speed, report)

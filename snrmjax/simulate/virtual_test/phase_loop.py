@@ -147,7 +147,8 @@ def phase_sweep(
         raise ValueError(f"`phases` must lie within ±90°, but are {phases} rad.")
     steps = [(voltage, phase) for phase in wanted.tolist()]
     motions, _, seconds = locked_motions(
-        *(laboratory, steps),
+        laboratory,
+        steps,
         gains=gains,
         settle_cycles=settle_cycles,
         record_cycles=record_cycles,
@@ -193,7 +194,7 @@ def locked_motions(
         numbers = (voltage, laboratory.frequency, laboratory.decay, *rates, phase)
         loop = PhaseLockedLoop(*(jnp.asarray(value, dtype=float) for value in numbers))
         record, state = run_test(
-            *(laboratory, loop, settle + keep), start=state, seed=seed + _NEXT_SEED * number
+            laboratory, loop, settle + keep, start=state, seed=seed + _NEXT_SEED * number
         )
         columns = (*record.report, record.force, record.velocity)
         frequency, angle, force, velocity = (np.asarray(column)[-keep:] for column in columns)
@@ -249,7 +250,8 @@ class _Locked(NamedTuple):
                 float(np.hypot(spread, from_phase) / np.sqrt(PARTS - 1)),
                 np.sqrt(density) * _propagated(self.gains, self.decay, seconds),
             ),
-            *(complex(force), complex(velocity)),
+            complex(force),
+            complex(velocity),
             max(scatter, float(np.sqrt(HANN * density / seconds))),
             float(np.sqrt(HANN * densities[1] / seconds)),
         )

@@ -191,7 +191,8 @@ def decay_test(
     """
     positive("decay_seconds", decay_seconds)
     (resonance,), state, seconds = locked_motions(
-        *(laboratory, [(voltage, 0.0)]),
+        laboratory,
+        [(voltage, 0.0)],
         gains=gains,
         settle_cycles=settle_cycles,
         record_cycles=record_cycles,
@@ -237,7 +238,9 @@ def steady_states_of(
     )
     first, dwell = test.steps.first / rate, test.steps.samples / rate
     fitted = stepped_sine_states(
-        *(recording, "force", ["velocity"]),
+        recording,
+        "force",
+        ["velocity"],
         harmonic_order=harmonic_order,
         level=level,
         sensors=(modes.sensors[sensor],),

@@ -89,7 +89,10 @@ def recorded_states(
     velocity = velocity_phasors(coefficients, frequency, modes.mode_shape)
     velocity = velocity + _rigid_body_velocity(model, frequency, force, velocity.shape[1])
     seen = _behind_instruments(
-        *(model, frequency, force, velocity),
+        model,
+        frequency,
+        force,
+        velocity,
         jnp.abs(displacement_phasors(coefficients)[:, 1, modes.mode_of_interest]),
     )
     written = np.asarray(seen[0]), np.asarray(seen[1])

@@ -94,7 +94,9 @@ class VirtualTests(AbstractIdentified):
     def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         """See `AbstractSingly.member`."""
         test = phase_resonance_test(
-            *(model, self.levels, *self.within.ends),
+            model,
+            self.levels,
+            *self.within.ends,
             points_per_level=self.points_per_level,
             recording=Recording(self.errors, seed=seed),
         )

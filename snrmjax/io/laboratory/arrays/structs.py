@@ -72,7 +72,11 @@ def file_of_tree(
     contents = contents._replace(tables=_joined_siblings(contents.tables))
     records = joined_structs(contents.recordings)
     return LaboratoryFile(
-        *(name, kind, tuple(records), tuple(contents.responses), contents.numbered()),
+        name,
+        kind,
+        tuple(records),
+        tuple(contents.responses),
+        contents.numbered(),
         tuple(dict.fromkeys(known)),
         tuple(np.nan for _ in contents.responses),
     )

@@ -225,13 +225,14 @@ def _columns(
             raise ValueError(f"{file} states no step (Delta_X) of channel {name}, and no times.")
         columns.append(
             _Column(
-                *(
-                    name,
-                    header_field("Y_Unit_Label"),
-                    header_field("X_Dimension"),
-                    start + _clock(header, index),
-                ),
-                *(step, n, x, table[index][:end]),
+                name,
+                header_field("Y_Unit_Label"),
+                header_field("X_Dimension"),
+                start + _clock(header, index),
+                step,
+                n,
+                x,
+                table[index][:end],
             )
         )
     comments = [

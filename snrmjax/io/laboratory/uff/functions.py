@@ -34,8 +34,12 @@ class _Source(NamedTuple):
         self.notes.extend(unit.notes)
         node = function.get(f"{side}_node", 0)
         return Channel(
-            *(_point_name(function, side), unit.quantity, unit.unit, unit.calibration),
-            *(str(node) if node else "", direction_of(function.get(f"{side}_dir", 0))),
+            _point_name(function, side),
+            unit.quantity,
+            unit.unit,
+            unit.calibration,
+            str(node) if node else "",
+            direction_of(function.get(f"{side}_dir", 0)),
         )
 
 
@@ -76,7 +80,11 @@ def read_uff(path: Path) -> LaboratoryFile:
     models = [stated(function.get("model_name", "")) for function in sets.of_type(151)]
     source.notes.extend(Fact("model_named", name=name) for name in models if name)
     return LaboratoryFile(
-        *(path.name, "uff", tuple(recordings), tuple(responses), tuple(tables)),
+        path.name,
+        "uff",
+        tuple(recordings),
+        tuple(responses),
+        tuple(tables),
         tuple(dict.fromkeys(source.notes)),
         tuple(levels),
     )
