@@ -21,9 +21,11 @@ from matplotlib.figure import Figure
 from truths.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
 
 import snrmjax as sj
+from snrmjax import cli
 from snrmjax.cli import app, main, simulate_commands
 from snrmjax.io import tables
 from snrmjax.io.units import HERTZ
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.style import png_bytes
 from snrmjax.simulate.continuation import event_equations
 
@@ -705,3 +707,25 @@ def test_phases_with_which_nothing_can_be_solved_are_named_in_the_error(
     assert done.code == 2
     assert named in " ".join(done.stderr.split())
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "printed"),
+    [
+        (InputError("`force_n` is missing."), 2, "error: `force_n` is missing."),
+        (ValueError("operands could not be broadcast together"), 1, "an error of snrmjax"),
+        (KeyError("mode"), 1, "an error of snrmjax"),
+    ],
+)
+def test_only_refusals_blame_the_input(error, code, printed, monkeypatch, capsys):
+    def command(**_):
+        raise error
+
+    monkeypatch.setattr(cli, "app", command)
+    monkeypatch.setattr(sys, "argv", ["snrmjax", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    out = "".join(capsys.readouterr())
+    assert ended.value.code == code
+    assert printed in " ".join(out.split())
+    assert ("Traceback" in out) == (code == 1)

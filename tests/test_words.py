@@ -65,3 +65,8 @@ def test_a_former_name_is_the_present_one_with_a_warning(room, former, present):
         assert getattr(room, former) is getattr(room, present)
     with pytest.raises(AttributeError):
         getattr(room, former + "s")
+
+
+def test_refusals_have_a_class_of_their_own():
+    """What NumPy or JAX raise is then no refusal."""
+    assert not [path for path in PACKAGE.rglob("*.py") if "raise ValueError" in path.read_text()]

@@ -6,6 +6,7 @@ Each imports its own dependencies, so that none waits for the imports of another
 import gc
 import os
 import sys
+import traceback
 from collections.abc import Callable
 
 import typer
@@ -23,6 +24,11 @@ from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
 from snrmjax.cli.whole_test_command import whole_test
+
+_OWN_ERROR = (
+    "this is an error of snrmjax and not of the input: please report it with the command and the "
+    "lines above."
+)
 
 app = typer.Typer(
     name="snrmjax",
@@ -95,7 +101,10 @@ app.add_typer(study_app)
 
 
 def main() -> None:
-    """Run the commands; wrong input ends with exit code 2 and one sentence."""
+    """Run the commands; wrong input ends with exit code 2 and one sentence.
+
+    An error of this package ends with exit code 1 and its traceback.
+    """
     # Imports and programs live to the end: garbage collection would take a tenth of the run time.
     gc.set_threshold(_OBJECTS)
     # Responses are many times slower on a GPU than on a CPU core, and every process would allocate
@@ -109,7 +118,13 @@ def main() -> None:
     try:
         with supervised():
             app(prog_name="snrmjax")
-    except ValueError as error:
+    except Exception as error:
+        from snrmjax.numerics.rules import InputError  # imports NumPy, for which help does not wait
+
+        if not isinstance(error, InputError):
+            traceback.print_exc()
+            refuse(_OWN_ERROR)
+            sys.exit(1)
         refuse(str(error))
         more = read_more(error)
         if more:

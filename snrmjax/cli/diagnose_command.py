@@ -7,6 +7,7 @@ import typer
 
 from snrmjax.cli.console import print_line, warn, written
 from snrmjax.cli.options import FILES, Out, stated_options, with_options
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import DiagnoseOptions
 from snrmjax.report.writing import staged
 
@@ -56,11 +57,11 @@ def diagnose(
     for option in ("plan", "add", "former") if several else ():
         if getattr(stated, option):
             flag = {"former": "continue"}.get(option, option)
-            raise ValueError(f"`--{flag}` is for one data file, but {len(data)} are given.")
+            raise InputError(f"`--{flag}` is for one data file, but {len(data)} are given.")
     if stated.plan is not None and not stated.plan.parent.is_dir():
-        raise ValueError(f"--plan {stated.plan} cannot be written: its folder does not exist.")
+        raise InputError(f"--plan {stated.plan} cannot be written: its folder does not exist.")
     if len({path.stem for path in data}) < len(data):
-        raise ValueError("two of the data files have the same name: they would share a folder.")
+        raise InputError("two of the data files have the same name: they would share a folder.")
     former = None if stated.former is None else read_former_answer(stated.former)
     simulate = not several if stated.responses is None else stated.responses
     refused = []
@@ -80,7 +81,7 @@ def diagnose(
                 page.write(folder, diagnosed, title=title, data=path.name)
                 if stated.plan is not None:
                     _write_plan(stated.plan, diagnosed.diagnosis)
-        except ValueError as error:
+        except InputError as error:
             if not several:
                 raise
             warn(f"{path.name}: {error}")
@@ -95,7 +96,7 @@ def diagnose(
     if not several:
         written(out)
     if refused:
-        raise ValueError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")
+        raise InputError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")
 
 
 with_options(diagnose, DiagnoseOptions)

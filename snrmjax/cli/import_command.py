@@ -10,6 +10,7 @@ import typer
 from snrmjax.cli.console import print_line, print_result
 from snrmjax.cli.options import FILES, with_options
 from snrmjax.io.exchange.import_map import KEYS, RESPONSE_KEYS, ImportMap, MapKey
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import option
 from snrmjax.report.writing import staged
 
@@ -57,7 +58,7 @@ def import_(
         typer.echo("\n".join(list_contents(files, **options)))
         return
     if out is None:
-        raise ValueError("where shall measured.csv be written? State `--out DIR`.")
+        raise InputError("where shall measured.csv be written? State `--out DIR`.")
     imported = import_test(files, map_file, **options)
     with staged(out) as folder:
         written = page.write(folder, imported, files=[os.path.relpath(file, out) for file in files])

@@ -7,6 +7,7 @@ import typer
 
 from snrmjax.cli.console import print_line, print_result
 from snrmjax.cli.options import FILES, stated_options, with_options
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import ModesOptions
 from snrmjax.report.writing import staged
 
@@ -47,9 +48,9 @@ def modes(
     from snrmjax.report.pages import modes as page
 
     if out.suffix.lower() != ".toml":
-        raise ValueError(f"--out must be a model to write (.toml), but is {out.name!r}.")
+        raise InputError(f"--out must be a model to write (.toml), but is {out.name!r}.")
     if out.is_dir():
-        raise ValueError(f"--out {out} is a folder, but a file to write is expected.")
+        raise InputError(f"--out {out} is a folder, but a file to write is expected.")
     stated = stated_options(ModesOptions, options)
     with staged(out.parent) as folder:
         second = read_modal_sources(stated.with_mass) if stated.with_mass else None

@@ -15,6 +15,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import typer
 from typer.core import TyperCommand
 
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import FILES, checked, flag_of
 
 Options = TypeVar("Options")
@@ -183,7 +184,7 @@ def require_positive(option: str, values: Sequence[float], unit: str) -> None:
     """Raise `ValueError` for a value of an option that is not above zero."""
     for value in values:
         if not 0 < value < float("inf"):
-            raise ValueError(f"`{option}` must be above zero, but is {value:g} {unit}.")
+            raise InputError(f"`{option}` must be above zero, but is {value:g} {unit}.")
 
 
 def with_options(command: Callable[..., None], *of: Any) -> None:

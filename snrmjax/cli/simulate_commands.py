@@ -6,6 +6,7 @@ import typer
 
 from snrmjax.cli.console import print_line, print_result, written
 from snrmjax.cli.options import Harmonics, Model, Out, require_positive
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.writing import staged
 
 EventKind = Literal["fold", "peak", "phase_resonance", "period_doubling", "neimark_sacker"]
@@ -94,19 +95,19 @@ def simulate(
     from snrmjax.report.pages import simulation
 
     if not 0 < from_hz < to_hz:
-        raise ValueError(
+        raise InputError(
             "`--from-hz` must be above zero and below `--to-hz`, but they are "
             f"{from_hz:g} and {to_hz:g} Hz."
         )
     structure = read_model(model)
     if force is None and structure.modes.unbalance is None:
-        raise ValueError("`--force` must be given: the amplitude of the force in N.")
+        raise InputError("`--force` must be given: the amplitude of the force in N.")
     loads = force or [1.0]
     require_positive("--force", loads, structure.modes.force_unit)
     if follow and to is None:
-        raise ValueError("`--follow` needs `--to`, the value that the parameter goes to.")
+        raise InputError("`--follow` needs `--to`, the value that the parameter goes to.")
     if follow is None and (to is not None or parameter != "force"):
-        raise ValueError("`--parameter` and `--to` need `--follow`, the kind of event.")
+        raise InputError("`--parameter` and `--to` need `--follow`, the kind of event.")
     with staged(out) as folder:
         result = simulate_responses(
             structure,

@@ -12,6 +12,7 @@ import typer
 
 from snrmjax.cli.console import INTERRUPTED, console, print_line, warn
 from snrmjax.cli.options import FILES, Out, add_command, stated_options, with_options
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import option
 from snrmjax.report.writing import staged
 
@@ -154,7 +155,7 @@ add_command(study_app, report, "report", ("snrmjax study report study.zarr --out
 def _shard(text: str) -> tuple[int, int]:
     part, slash, parts = text.partition("/")
     if not (slash and part.isdecimal() and parts.isdecimal()):
-        raise ValueError(f"`--shard` must be I/N, such as 2/8, but is {text!r}.")
+        raise InputError(f"`--shard` must be I/N, such as 2/8, but is {text!r}.")
     return int(part), int(parts)
 
 

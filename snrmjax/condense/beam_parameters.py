@@ -21,7 +21,7 @@ from snrmjax.condense.beam_description import (
 )
 from snrmjax.condense.elements.beam import rise_of_radius
 from snrmjax.numerics.names import suggestion
-from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, Rule
+from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, InputError, Rule
 
 _FIXED = "it is fixed there; to vary its stiffness state one, such as {side} = {{ {key} = 1e6 }}"
 
@@ -66,7 +66,7 @@ def check_beam_name(beam: BeamDescription, name: str, file: str, further: tuple[
         ends = {parameter.rpartition(".")[2]: parameter for parameter in reversed(known)}
         near = suggestion(ends.get(name, name), known, 0.5) or f"; it has {', '.join(known[:6])}, …"
         why = f"the beam of {file} does not have the parameter {name!r}{near}."
-    raise ValueError(why)
+    raise InputError(why)
 
 
 def beam_rules(beam: BeamDescription, name: str, varied: tuple[str, ...]) -> tuple[Rule, ...]:
@@ -105,20 +105,20 @@ def require_beam(beam: BeamDescription) -> None:
     numbers = dict(beam.numbers)
     length, thickness, radius = numbers[LENGTH], numbers[THICKNESS], numbers.get(RADIUS)
     if not thickness < length:
-        raise ValueError(f"the thickness ({thickness:g} m) is not below the length ({length:g} m).")
+        raise InputError(f"the thickness ({thickness:g} m) is not below the length ({length:g} m).")
     if radius is not None and not length < 2 * MAX_RISE * radius:
-        raise ValueError(
+        raise InputError(
             f"a radius of {radius:g} m is too small for a length of {length:g} m: the "
             "arch must stay below a half circle."
         )
     if not 2 * rise_of(beam) < length:
-        raise ValueError(
+        raise InputError(
             f"a rise of {rise_of(beam):g} m is too large for a length of {length:g} m: the "
             "arch must stay below a half circle."
         )
     loose = unconstrained_motion(numbers)
     if loose is not None:
-        raise ValueError(f"the supports leave a mechanism: {loose}.")
+        raise InputError(f"the supports leave a mechanism: {loose}.")
 
 
 def _below(what: str, limit: float) -> Rule:

@@ -23,6 +23,7 @@ from snrmjax.condense.load_set import StaticSolver
 from snrmjax.condense.reduction import ASSUMED_DAMPING, ReductionSource, ShapeLines
 from snrmjax.model.modes import have_values
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _BLOCK = 8  # load cases at once
 _NODE = 1e-9  # of the largest shape, below which a point is a node of all modes
@@ -38,8 +39,8 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
     beam = beam_of(stated)
     try:
         basis = beam_modes(beam, stated.modes)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
     modal = _modal_data(beam, basis, stated.sensors, stated.force_at)
     known = have_values((basis, modal))
     if known:
@@ -72,10 +73,10 @@ def _require_moving(stated: BeamDescription, modal: "_ModalData", file: str) -> 
     largest = float(np.max(modal.largest))
     for name, at in stated.sensors:
         if not np.max(np.abs(modal.sensors[name])) > _NODE * largest:
-            raise ValueError(f"[sensors] of {file} has `{name}` at {at:g}, where no mode moves.")
+            raise InputError(f"[sensors] of {file} has `{name}` at {at:g}, where no mode moves.")
     if not np.max(np.abs(modal.participation)) > _NODE * largest:
         position = "uniform" if stated.force_at is None else f"at {stated.force_at:g}"
-        raise ValueError(f"[force] of {file} is {position}, where no mode moves.")
+        raise InputError(f"[force] of {file} is {position}, where no mode moves.")
 
 
 class _ModalData(NamedTuple):

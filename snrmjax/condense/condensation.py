@@ -31,6 +31,7 @@ from snrmjax.model.potential import PolynomialPotential, monomial_key
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, setting
+from snrmjax.numerics.rules import InputError
 
 
 class FitQuality(eqx.Module):
@@ -140,14 +141,14 @@ def reduced_model(basis: ReductionBasis, cases: StaticCases, *, degree: int = 3)
     check_degree(degree)
     n_modes = len(basis.numbers)
     if cases.force.shape[1] != n_modes:
-        raise ValueError(
+        raise InputError(
             f"the load cases have {cases.force.shape[1]} modes, but the basis has {n_modes}."
         )
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((basis, cases))):
         return _unchecked(basis, cases, degree)
     used = np.flatnonzero(cases.usable)
     if not used.size:
-        raise ValueError(
+        raise InputError(
             f"none of the {len(cases.force)} load cases has a solution: smaller loads are needed."
         )
     arrays = dataclasses.replace(cases, names=())
@@ -156,7 +157,7 @@ def reduced_model(basis: ReductionBasis, cases: StaticCases, *, degree: int = 3)
     for what, rows in (("force", solved.force), ("modal displacement", solved.modal_displacement)):
         zero_modes = np.flatnonzero(~np.any(np.asarray(rows) != 0, axis=0))
         if zero_modes.size:
-            raise ValueError(
+            raise InputError(
                 f"the {what} of mode {basis.numbers[zero_modes[0]]} is zero in every load case."
             )
     system = fit_system(basis, solved, monomials)

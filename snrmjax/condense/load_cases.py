@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from snrmjax.numerics.rules import InputError
+
 
 class ReductionBasis(eqx.Module):
     """The linear modes that a reduced model keeps, of a model with mass M and stiffness K.
@@ -50,7 +52,7 @@ class StaticCases(eqx.Module):
     def __check_init__(self) -> None:
         """Raises `ValueError` for inconsistent numbers of rows or modes."""
         if self.force.shape != self.modal_displacement.shape:
-            raise ValueError(
+            raise InputError(
                 f"`force` has the shape {self.force.shape}, `modal_displacement` "
                 f"{self.modal_displacement.shape}: both are (case, mode)."
             )
@@ -58,9 +60,9 @@ class StaticCases(eqx.Module):
         for name in ("converged", "energy", "displacement"):
             rows = getattr(self, name)
             if rows is not None and len(rows) != cases:
-                raise ValueError(f"`{name}` has {len(rows)} rows for {cases} cases.")
+                raise InputError(f"`{name}` has {len(rows)} rows for {cases} cases.")
         if self.names and len(self.names) != cases:
-            raise ValueError(f"`names` has {len(self.names)} entries for {cases} cases.")
+            raise InputError(f"`names` has {len(self.names)} entries for {cases} cases.")
 
     @property
     def usable(self) -> np.ndarray:

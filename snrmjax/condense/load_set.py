@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.potential_fit import check_degree
 from snrmjax.model.modes import have_values
+from snrmjax.numerics.rules import InputError
 
 NONLINEAR_RATIO = 0.02
 """Default load scale: the nonlinear part of the force is 2 % of the linear one.
@@ -68,15 +69,15 @@ def modal_loads(
     wanted = jnp.asarray(displacement, dtype=jnp.float64)
     known = np.asarray(wanted) if have_values(wanted) else np.ones(wanted.shape)
     if wanted.shape not in ((), (n,)) or not np.all(np.isfinite(known) & (known > 0)):
-        raise ValueError(
+        raise InputError(
             f"`displacement` must be positive (m), one number or one for each of the {n} modes, "
             f"but is {displacement}."
         )
     if most_modes is not None and most_modes < 1:
-        raise ValueError(f"`most_modes` must be at least 1, but is {most_modes}.")
+        raise InputError(f"`most_modes` must be at least 1, but is {most_modes}.")
     fractions = default_levels(n, degree) if levels is None else tuple(levels)
     if not fractions or not all(np.isfinite(level) and level > 0 for level in fractions):
-        raise ValueError(f"`levels` must be positive fractions, at least one, but is {levels}.")
+        raise InputError(f"`levels` must be positive fractions, at least one, but is {levels}.")
     signs = _combinations(n, min(n, most_modes or degree))
     alone = basis.frequency**2 * wanted / basis.largest
     rows = signs / np.sum(np.abs(signs), axis=1, keepdims=True)
@@ -124,7 +125,7 @@ def displacement_for_ratio(
     """
     n = len(basis.numbers)
     if not 0 < ratio < 1:
-        raise ValueError(f"`ratio` must lie between 0 and 1, but is {ratio}.")
+        raise InputError(f"`ratio` must lie between 0 and 1, but is {ratio}.")
     amplitude = np.broadcast_to(np.asarray(start, dtype=float), (n,)).copy()
     before = (amplitude, np.full(n, np.nan))
     low, high = np.zeros(n), np.full(n, np.inf)  # brackets of the displacement
@@ -148,7 +149,7 @@ def displacement_for_ratio(
         why = f"the load cases at {last} have no solution"
     else:
         why = f"it is {current[worst]:.3g} at {last}"
-    raise ValueError(
+    raise InputError(
         f"no load along mode {basis.numbers[worst]} has a nonlinear force of {ratio:g} times the "
         f"linear one ({why}): state the load scale."
     )

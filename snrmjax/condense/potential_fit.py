@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.model.potential import Monomial, PolynomialPotential, monomial_key
+from snrmjax.numerics.rules import InputError
 
 _NOT_EXCITED = 1e-7  # of a unit column: a monomial that no load case excites
 _SINGULAR = 1e11  # condition number of the scaled columns above which coefficients are arbitrary
@@ -47,7 +48,7 @@ def monomials_of(n_modes: int, degree: int, lowest: int = 2) -> tuple[Monomial, 
 def check_degree(degree: int) -> None:
     """Raises `ValueError` for a degree of the force that is not from 2 to 7."""
     if isinstance(degree, bool) or not isinstance(degree, int) or not 2 <= degree <= 7:
-        raise ValueError(f"`degree` of the force must be a whole number from 2 to 7, not {degree}.")
+        raise InputError(f"`degree` of the force must be a whole number from 2 to 7, not {degree}.")
 
 
 def fit_system(
@@ -168,7 +169,7 @@ def require_determined(system: FitSystem, monomials: tuple[Monomial, ...], n_use
     rows = np.asarray(system.design).reshape(-1, len(monomials))
     equations = n_used * system.design.shape[1]
     if equations < len(monomials):
-        raise ValueError(
+        raise InputError(
             f"{n_used} usable load cases give {equations} equations for {len(monomials)} "
             "coefficients: more load cases, or a lower degree, are needed."
         )
@@ -185,7 +186,7 @@ def require_determined(system: FitSystem, monomials: tuple[Monomial, ...], n_use
             monomial_key(monomials[k]) for k in np.flatnonzero(fraction > 0.3 * fraction.max())
         ]
     names = ", ".join(undetermined[:6]) + (", …" if len(undetermined) > 6 else "")
-    raise ValueError(
+    raise InputError(
         f"the load cases do not determine these coefficients separately: {names} (modes of the "
         "reduced model); combine more modes, add load levels, or lower the degree."
     )

@@ -14,6 +14,7 @@ from snrmjax.condense.load_set import StaticSolver, displacement_for_ratio, moda
 from snrmjax.condense.scale_study import SCALES
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 ASSUMED_DAMPING = 0.01
 """Default damping ratio of a mode, which a finite-element model does not have."""
@@ -67,7 +68,7 @@ def run_load_cases(
     `displacement_for_ratio` does.
     """
     if source.solve is None:
-        raise ValueError(f"{source.name} has neither load cases nor a solver for them.")
+        raise InputError(f"{source.name} has neither load cases nor a solver for them.")
     n = len(source.basis.numbers)
     if displacement is None and source.load_scale is not None:
         displacement = np.full(n, source.load_scale * (source.thickness or 1.0))

@@ -13,6 +13,7 @@ from snrmjax.condense.load_set import StaticSolver, modal_loads
 from snrmjax.condense.potential_fit import fit_system, monomials_of, solve_scaled
 from snrmjax.model.potential import Monomial, monomial_key
 from snrmjax.numerics.result import AbstractResult, Variable, quantity
+from snrmjax.numerics.rules import InputError
 
 SCALES = tuple(float(scale) for scale in np.logspace(-2.0, 0.75, 12))
 """Default multiples of the displacement: two decades below and three quarters of one above."""
@@ -99,7 +100,7 @@ def load_scale_study(
     """
     scale = np.asarray(scales, dtype=float)
     if scale.ndim != 1 or scale.size < 2 or not np.all(np.diff(scale) > 0) or not scale[0] > 0:
-        raise ValueError(f"`scales` must be positive and ascending, at least two, but is {scales}.")
+        raise InputError(f"`scales` must be positive and ascending, at least two, but is {scales}.")
     monomials = monomials_of(len(basis.numbers), degree)
     coefficient = np.full((scale.size, len(monomials)), np.nan)
     misfit, ratio = np.full(scale.size, np.nan), np.full(scale.size, np.nan)

@@ -64,6 +64,7 @@ from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
+from snrmjax.numerics.rules import InputError
 
 
 @on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
@@ -163,7 +164,7 @@ def _check_states(predictions: Predictions) -> None:
     unknown, least = predictions.chosen.phase_unknown[:, 0], 6
     n = len(unknown)
     if 2 * n - unknown.sum() < 2 * least:
-        raise ValueError(
+        raise InputError(
             f"a diagnosis needs at least {least} usable steady states, or {2 * least} where phases "
             f"are unknown, not {n}."
         )
@@ -173,7 +174,7 @@ def _corrected_predictions(predictions: Predictions, data: SteadyStates) -> Pred
     """Predictions of corrected records, weighted by the smooth curves through the states."""
     predictions = with_reference(predictions)
     if not np.isfinite(weighted_misfit(predictions).base).all():
-        raise ValueError(
+        raise InputError(
             "the model has no motion of the measured amplitude for some states: it is too far "
             "from the data for a comparison."
         )

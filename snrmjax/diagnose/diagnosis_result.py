@@ -25,7 +25,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
-from snrmjax.numerics.rules import Rule
+from snrmjax.numerics.rules import InputError, Rule
 
 
 class CompletedStatus(StrEnum):
@@ -62,12 +62,12 @@ def completed_model(
         for name, value in baseline.items():
             for rule in (Rule("finite", np.isfinite), *parameter_rules(model, name)):
                 if not rule.good(value):
-                    raise ValueError(f"`{name}` must be {rule.expected}, but is {value:.4g}.")
+                    raise InputError(f"`{name}` must be {rule.expected}, but is {value:.4g}.")
         added = tuple(
             make_effect(kind, {name: values[f"{kind}.{name}"] for name in effect_parameters(kind)})
             for kind in kinds
         )
-    except ValueError as error:
+    except InputError as error:
         return CompletedModel(None, CompletedStatus.NOT_PHYSICAL, str(error))
     updated = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
     completed = dataclasses.replace(updated, effects=(*model.effects, *added))

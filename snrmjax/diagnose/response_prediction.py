@@ -16,6 +16,7 @@ from snrmjax.identify.test_model.priors import ONE_PHASE
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
@@ -71,7 +72,7 @@ def predict_levels(diagnosis: Diagnosis, model: Structure) -> LevelPredictions:
     `snrmjax.identify.inverse_force`.
     """
     if diagnosis.completed is None:
-        raise ValueError("there is no completed model to simulate: see the notes of the diagnosis.")
+        raise InputError("there is no completed model to simulate: see the notes of the diagnosis.")
     return predicted_levels(
         model,
         diagnosis.completed,

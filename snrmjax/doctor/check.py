@@ -31,6 +31,7 @@ from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 
 @on_numbers("Differentiate `sj.identify.identify_points`.")
@@ -66,7 +67,7 @@ def check_test(
     """
     given = [tables] if isinstance(tables, SteadyStates) else list(tables)
     if not given and not recordings:
-        raise ValueError("there is nothing to check: give a table or a recording.")
+        raise InputError("there is nothing to check: give a table or a recording.")
     findings: list[Finding] = []
     notes: list[Fact] = []
     if given:

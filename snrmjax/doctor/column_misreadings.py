@@ -16,6 +16,7 @@ from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 
 def caveat(
@@ -106,7 +107,7 @@ def linear_damping_note(fit: JointFit, model: Structure) -> tuple[Fact, ...]:
     )
 
 
-def with_caveat(error: ValueError, data: SteadyStates, model: Structure) -> ValueError:
+def with_caveat(error: InputError, data: SteadyStates, model: Structure) -> InputError:
     """The error of an identification, with the misread column as its probable cause."""
     notes = caveat(data, model)
-    return ValueError(" ".join((str(error), *map(str, notes)))) if notes else error
+    return InputError(" ".join((str(error), *map(str, notes)))) if notes else error

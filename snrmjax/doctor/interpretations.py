@@ -17,6 +17,7 @@ from snrmjax.doctor.fitted_hypothesis import (
 from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _DEGREES = 180 / np.pi
 
@@ -113,7 +114,7 @@ class Interpretation(NamedTuple):
         """The more likely fit."""
         fit = self.scale.fit if self.rescaled and self.scale else self.as_modelled
         if fit is None:
-            raise ValueError("an interpretation that was not fitted has no fit.")
+            raise InputError("an interpretation that was not fitted has no fit.")
         return fit
 
     def of_any_mass(self, *, far: bool = False) -> "Interpretation":
@@ -219,7 +220,7 @@ def misread(recorded: FittedHypothesis, best: Interpretation, where: str) -> Fin
     """Finding of a misread column of phasors."""
     meaning = best.meaning
     if meaning.kind is None:
-        raise ValueError("the table as recorded is not a misreading.")
+        raise InputError("the table as recorded is not a misreading.")
     evidence = Fact(
         "misread",
         reading=meaning.name,

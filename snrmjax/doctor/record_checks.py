@@ -23,6 +23,7 @@ from snrmjax.measure.recordings.steps import Step, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import track_tone
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _HIGHEST = 12  # harmonic of the force
 
@@ -49,7 +50,7 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[Fact]
     try:
         track = track_tone(recording, force)
         steps = recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
-    except ValueError as error:
+    except InputError as error:
         no_tone = Fact("record_without_tone", record=name, error=str(error))
         return [*clipped.values()], [*notes, no_tone]
     steps = [

@@ -7,7 +7,16 @@ from typing import NamedTuple
 from snrmjax.io.rows import Cells, shortened_name
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
-from snrmjax.numerics.rules import FRACTION, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, SHORT, WHOLE, Rule
+from snrmjax.numerics.rules import (
+    FRACTION,
+    IN_RANGE_HZ,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHORT,
+    WHOLE,
+    InputError,
+    Rule,
+)
 
 PHASOR = ("velocity_re_m_s", "velocity_im_m_s")
 """Real and imaginary part of the fundamental."""
@@ -105,7 +114,7 @@ def read_header(cells: Cells, *, force_known: bool = False) -> Header:
         expected = _misnamed(name)
         other_force_known = expected in FORCES and not used.isdisjoint(FORCES)
         if expected is not None and (expected in used or not other_force_known):
-            raise ValueError(
+            raise InputError(
                 f"the column `{shortened_name(name)}` of {file} is not one of the format: "
                 f"expected `{expected}`."
             )
@@ -126,16 +135,16 @@ def _require(used: set[str], further: list[str], file: str, force_known: bool) -
 
     for name in REQUIRED:
         if name not in used and not (name in PHASOR and AMPLITUDE in used):
-            raise ValueError(f"{file} lacks the column `{name}`{instead(name)}.")
+            raise InputError(f"{file} lacks the column `{name}`{instead(name)}.")
     forces = used.intersection(FORCES)
     _require_base(used, forces, file)
     if BASE[0] in used:
         return
     if not forces and not force_known:
         near = instead("force_n") or instead("drive_v")
-        raise ValueError(f"{file} lacks the column `force_n` or `drive_v`{near}.")
+        raise InputError(f"{file} lacks the column `force_n` or `drive_v`{near}.")
     if len(forces) == 2:
-        raise ValueError(
+        raise InputError(
             f"{file} must have either `force_n` or `drive_v`, but has both columns: "
             "`drive_v` is for a force that is only known in volts."
         )
@@ -146,15 +155,15 @@ def _require_base(used: set[str], forces: set[str], file: str) -> None:
     of_base = used.intersection(BASE)
     if len(of_base) == 1:
         missing = next(name for name in BASE if name not in used)
-        raise ValueError(f"{file} has the column `{of_base.pop()}`, but lacks `{missing}`.")
+        raise InputError(f"{file} has the column `{of_base.pop()}`, but lacks `{missing}`.")
     if of_base and forces:
-        raise ValueError(
+        raise InputError(
             f"{file} must have either a force or the acceleration of a base, but has the columns "
             f"`{sorted(forces)[0]}` and `{BASE[0]}`."
         )
     wrong, right = (("force_std_n", BASE_STD), (BASE_STD, "force_std_n"))[not of_base]
     if wrong in used:
-        raise ValueError(
+        raise InputError(
             f"{file} has the column `{wrong}`, but "
             + ("a base moves it" if of_base else "no base's acceleration")
             + f": expected `{right}`."
@@ -168,7 +177,7 @@ def _harmonic_orders(used: set[str], file: str) -> tuple[int, ...]:
         order = int(match[1] or 0)
         for partner in harmonic_columns(order):
             if partner not in used:
-                raise ValueError(f"{file} has the column `{match[0]}`, but lacks `{partner}`.")
+                raise InputError(f"{file} has the column `{match[0]}`, but lacks `{partner}`.")
         orders.add(order)
     return tuple(sorted(orders))
 

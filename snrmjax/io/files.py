@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 FilePath = str | os.PathLike[str]
 
@@ -22,11 +23,11 @@ def read_bytes(path: FilePath, most: int = -1) -> bytes:
         with open(path, "rb") as file:
             return file.read(most)
     except FileNotFoundError as error:
-        raise ValueError(f"{os.fspath(path)} does not exist.") from error
+        raise InputError(f"{os.fspath(path)} does not exist.") from error
     except IsADirectoryError as error:
-        raise ValueError(f"{os.fspath(path)} is a folder, but a file is expected.") from error
+        raise InputError(f"{os.fspath(path)} is a folder, but a file is expected.") from error
     except OSError as error:
-        raise ValueError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
+        raise InputError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
 
 
 def read_text(path: FilePath) -> str:
@@ -36,11 +37,11 @@ def read_text(path: FilePath) -> str:
     """
     content = read_bytes(path)
     if b"\0" in content:
-        raise ValueError(f"{file_name(path)} is not a UTF-8 text file (it has NUL bytes).")
+        raise InputError(f"{file_name(path)} is not a UTF-8 text file (it has NUL bytes).")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(
+        raise InputError(
             f"{file_name(path)} is not a UTF-8 text file (byte {error.start + 1} breaks it)."
         ) from error
 
@@ -54,12 +55,12 @@ def written_whole(path: FilePath) -> Iterator[Path]:
     target = Path(os.path.realpath(path))  # a link stays a link
     temporary = target.with_name(f".{uuid.uuid4().hex}.tmp")
     if not target.parent.is_dir():
-        raise ValueError(f"{os.fspath(path)} cannot be written: its folder does not exist.")
+        raise InputError(f"{os.fspath(path)} cannot be written: its folder does not exist.")
     try:
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
-        raise ValueError(f"{os.fspath(path)} cannot be written: {error.strerror}.") from error
+        raise InputError(f"{os.fspath(path)} cannot be written: {error.strerror}.") from error
     finally:
         temporary.unlink(missing_ok=True)
 

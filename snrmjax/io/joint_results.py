@@ -22,6 +22,7 @@ from snrmjax.io.results import load_named, write_values
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 
 BAND_POINTS = 200
@@ -150,12 +151,12 @@ def read_joint_fit(path: FilePath) -> JointFit:
     try:
         content = json.loads(read_text(path))
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is no joint fit: {error}.") from error
+        raise InputError(f"{path} is no joint fit: {error}.") from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
-        raise ValueError(f"{path} is no joint fit of format {_FORMAT}.")
+        raise InputError(f"{path} is no joint fit of format {_FORMAT}.")
     fit = _decoded(content.get("fit"))
     if not isinstance(fit, JointFit):
-        raise ValueError(f"{path} is no joint fit: it contains another object.")
+        raise InputError(f"{path} is no joint fit: it contains another object.")
     return fit
 
 
@@ -209,9 +210,9 @@ def _class(name: str) -> Any:
     """A class of this package; no other class is created from a file."""
     module, _, qualified = name.partition(":")
     if not module.startswith("snrmjax.") or not qualified.isidentifier():
-        raise ValueError(f"a joint fit is not made of {name}.")
+        raise InputError(f"a joint fit is not made of {name}.")
     named = getattr(importlib.import_module(module), qualified, None)
     is_allowed = isinstance(named, type) and issubclass(named, tuple | Status | eqx.Module)
     if not is_allowed:
-        raise ValueError(f"a joint fit is not made of {name}.")
+        raise InputError(f"a joint fit is not made of {name}.")
     return named

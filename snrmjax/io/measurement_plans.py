@@ -13,6 +13,7 @@ from snrmjax.io.tables import read_steady_states, write_table
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import InputError
 
 _DIGITS = 6  # of planned numbers
 
@@ -70,7 +71,7 @@ def read_further_states(path: FilePath, model: Structure, first: SteadyStates) -
     volts = [bool(np.isfinite(np.asarray(part.drive)).any()) for part in (first, further)]
     if volts[0] != volts[1]:
         names = ["`drive_v`" if volt else "`force_n`" for volt in volts]
-        raise ValueError(
+        raise InputError(
             f"further states must have the column {names[0]} as the first ones have, but "
             f"{file_name(path)} has {names[1]}."
         )
@@ -104,7 +105,7 @@ def read_former_answer(path: FilePath) -> FormerAnswer:
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
             raise
-        raise ValueError(
+        raise InputError(
             f"{file} must be a diagnosis.json that `snrmjax diagnose` wrote, but is none "
             f"({shown(str(error))})."
         ) from error

@@ -40,7 +40,7 @@ from snrmjax.model.potential import (
 )
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.names import near_miss, suggestion
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, InputError, Rule
 
 _TOP_KEYS = (
     *("name", "mode_of_interest", "mode", "rigid_body_mode", "damping_coupling"),
@@ -111,7 +111,7 @@ def _read(text: str, file: str, path: Path) -> Structure:
     if "structure" in top.entries:
         for key in _OF_MODES:
             if key in top.entries:
-                raise ValueError(f"{file} has both [structure] and `{key}`: matrices or modes.")
+                raise InputError(f"{file} has both [structure] and `{key}`: matrices or modes.")
         built = structure_of_matrices(top, file, path.parent, effects)
         modes, potential = built.modes, built.potential
     else:
@@ -137,7 +137,7 @@ def _check_point(modes: LinearModes, point: str, location: str) -> None:
     try:
         modes.shape_at(point)
     except ValueError as error:
-        raise ValueError(f"{location} cannot be read: {error}") from error
+        raise InputError(f"{location} cannot be read: {error}") from error
 
 
 def _numbers(table: TomlTable, required: _Rules, optional: _Rules) -> dict[str, float]:
@@ -152,7 +152,7 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
     flexible = [_numbers(table, _MODE, _MODE_STD | _MODE_FURTHER) for table in tables]
     rigid = [_numbers(table, _RIGID_BODY_MODE, {}) for table in rigid_tables]
     if not flexible:
-        raise ValueError(f"{file} must have at least one mode with a shape, under [[mode]].")
+        raise InputError(f"{file} must have at least one mode with a shape, under [[mode]].")
     of_interest = top.whole("mode_of_interest", 1, 1)
     if of_interest > len(flexible):
         expected = f"from 1 to the number of modes ({len(flexible)})"
@@ -163,30 +163,30 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
         for sensor in sensors:
             if sensor not in shape.entries:
                 near = near_miss(sensor, set(shape.entries) - set(sensors))
-                raise ValueError(
+                raise InputError(
                     f"{shape.location} lacks the sensor {shown(sensor)}, which mode 1 "
                     f"has{'' if near is None else f' (is it {shown(near)}?)'}."
                 )
         for sensor in shape.entries:
             if sensor not in sensors:
-                raise ValueError(
+                raise InputError(
                     f"{shape.location} has the sensor {shown(sensor)}, which mode 1 lacks."
                 )
     mode_shape = np.array([[shape.number(name) for shape in shapes] for name in sensors])
     if not np.any(mode_shape[:, of_interest - 1]):
-        raise ValueError(
+        raise InputError(
             f"{file} must have at least one mode with a shape, but the mode of interest "
             f"({of_interest}) is zero at every sensor."
         )
 
     if not any(m["participation"] or m.get("participation_lag") for m in (*flexible, *rigid)):
-        raise ValueError(
+        raise InputError(
             f"{file} has no mode that the force excites: expected a `participation` other than "
             "zero for at least one mode."
         )
     base = moving_base(top, file)
     if base is not None and rigid_tables:
-        raise ValueError(
+        raise InputError(
             f"{file} has both [base] and [[rigid_body_mode]]: a base constrains rigid-body motion."
         )
     n, participation = len(flexible), np.array([m["participation"] for m in (*flexible, *rigid)])
@@ -207,7 +207,7 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
         for sensor in listed:
             if sensor not in names:
                 near = suggestion(sensor, names)
-                raise ValueError(
+                raise InputError(
                     f"[sensors] of {file} lists {shown(sensor)}, which no mode has{near}."
                 )
         sensors = tuple(listed)
@@ -262,11 +262,11 @@ def _shape(mode: TomlTable) -> TomlTable:
     """The shape of one mode, its value at each sensor, checked."""
     table = mode.table("shape", f"the shape of {mode.location}")
     if not table.entries:
-        raise ValueError(f"{table.location} must have at least one sensor.")
+        raise InputError(f"{table.location} must have at least one sensor.")
     for sensor in table.entries:
         if sensor != sensor.strip() or sensor == "" or not sensor.isprintable():
             must = "the name of a sensor must be a text without spaces around it"
-            raise ValueError(f"{must}, but {table.location} has {sensor!r}.")
+            raise InputError(f"{must}, but {table.location} has {sensor!r}.")
         table.number(sensor)
     return table
 
@@ -278,10 +278,10 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
         try:
             monomial = parse_monomial(name, n_modes)
         except ValueError as error:
-            raise ValueError(f"{table.location} cannot be read: {error}") from error
+            raise InputError(f"{table.location} cannot be read: {error}") from error
         if monomial in coefficients:
             twice = f"{table.location} has the monomial {name!r} twice"
-            raise ValueError(f"{twice} (the order of modes is free).")
+            raise InputError(f"{twice} (the order of modes is free).")
         if isinstance(value, dict):
             entry = TomlTable(value, f"monomial {name!r} in {table.location}")
             entry.check_keys(("coefficient",), ("std",))
@@ -294,11 +294,11 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
 
 def _effect(table: TomlTable) -> AbstractEffect:
     if "kind" not in table.entries:
-        raise ValueError(f"{table.location} lacks the key `kind`.")
+        raise InputError(f"{table.location} lacks the key `kind`.")
     kind, known_kinds = table.text("kind"), tuple(known_effects())
     if kind not in known_kinds:
         near = suggestion(kind, known_kinds) or f" (known are {', '.join(sorted(known_kinds))})"
-        raise ValueError(f"{table.location} has the unknown kind {shown(kind)}{near}.")
+        raise InputError(f"{table.location} has the unknown kind {shown(kind)}{near}.")
     wanted = effect_class(kind).parameters()
     table = TomlTable(table.entries, f"{table.location} ({kind})")
     across = ("normal_at", "normal_between") if kind in SURFACES else ()
@@ -314,14 +314,14 @@ def _effect(table: TomlTable) -> AbstractEffect:
             kind, values, at=_influence_vector(table), normal_at=_influence_vector(table, "normal_")
         )
     except ValueError as error:
-        raise ValueError(f"{table.location} cannot be read: {error}") from error
+        raise InputError(f"{table.location} cannot be read: {error}") from error
 
 
 def _influence_vector(table: TomlTable, side: str = "") -> InfluenceVector | None:
     """Influence vector of an effect: `at` a point or weighted points, `between` two points."""
     one, pair = f"{side}at", f"{side}between"
     if one in table.entries and pair in table.entries:
-        raise ValueError(f"{table.location} has both `{one}` and `{pair}`.")
+        raise InputError(f"{table.location} has both `{one}` and `{pair}`.")
     if pair in table.entries:
         two = table.entries[pair]
         if not isinstance(two, list) or len(two) != 2 or not all(isinstance(p, str) for p in two):
@@ -346,7 +346,7 @@ def write_model(path: FilePath, model: Structure) -> None:
     Raises `ValueError` for a model that the reader would refuse.
     """
     if model.modes.natural_frequency.ndim != 1:
-        raise ValueError("`model` must be one structure, but is a batch of them.")
+        raise InputError("`model` must be one structure, but is a batch of them.")
     # Without signed zeros: matrices of one column lose the sign of zero in reading.
     unsigned = jax.tree.map(lambda leaf: np.asarray(leaf) + 0.0, model)
     text = tomli_w.dumps(_entries(unsigned))
@@ -429,7 +429,7 @@ def _entries(model: Structure) -> dict[str, object]:
 
 def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
     if effect.kind not in known_effects():
-        raise ValueError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
+        raise InputError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
     entry: dict[str, object] = {"kind": effect.kind}
     for side in ("at", "normal_at"):
         row = getattr(effect, side, None)
@@ -446,5 +446,5 @@ def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
 def _one(name: str, value: object) -> float:
     number = np.asarray(value, dtype=np.float64)
     if number.ndim != 0:
-        raise ValueError(f"`{name}` must be one number, but has shape {number.shape}.")
+        raise InputError(f"`{name}` must be one number, but has shape {number.shape}.")
     return float(number)

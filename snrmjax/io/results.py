@@ -9,6 +9,7 @@ from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.continuation.response_curve import (
     ResponseCurve,
@@ -84,7 +85,7 @@ def write_event_curves(
     Raises `ValueError` without a curve, when there is no such sensor or the file cannot be written.
     """
     if not curves:
-        raise ValueError("there is no curve of events to write.")
+        raise InputError("there is no curve of events to write.")
     r = _sensor_index(curves[0].sensors, sensor)
     n_points = [len(c.frequency) for c in curves]
     velocity = np.concatenate([velocity_at_sensors(c, c.force)[:, :, r] for c in curves])
@@ -117,7 +118,7 @@ def write_quasi_periodic(
     written.
     """
     if not branches:
-        raise ValueError("there is no branch of quasi-periodic motions to write.")
+        raise InputError("there is no branch of quasi-periodic motions to write.")
     r = _sensor_index(branches[0].sensors, sensor)
 
     def joined(values: str) -> np.ndarray:
@@ -379,7 +380,7 @@ def summarise_distribution(distribution: "ResonanceDistribution") -> dict:
 def _sensor_index(sensors: tuple[str, ...], name: str | None) -> int:
     """Index of a sensor; the first without a name."""
     if name is not None and name not in sensors:
-        raise ValueError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
+        raise InputError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
     return 0 if name is None else sensors.index(name)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.io.files import FilePath, file_name, read_bytes, read_text, shown
-from snrmjax.numerics.rules import Rule
+from snrmjax.numerics.rules import InputError, Rule
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _LIKE_GROUPED_NUMBER = re.compile(r"[+-]?[0-9][0-9.,'_\s]*(?:[eE][+-]?[0-9]+)?")
@@ -42,12 +42,12 @@ class Cells(NamedTuple):
         for row in self.rows:
             if len(row.fields) != width:
                 marks = " (numbers need a point as decimal sign and no thousands separators)"
-                raise ValueError(
+                raise InputError(
                     f"each row must have {width} fields as the header has, but row {row.number} "
                     f"of {file} has {len(row.fields)}{marks if len(row.fields) > width else ''}."
                 )
         if not self.rows:
-            raise ValueError(f"{file} has a header, but no rows below it.")
+            raise InputError(f"{file} has a header, but no rows below it.")
 
     def has(self, column: str) -> bool:
         """Whether there is such a column."""
@@ -58,14 +58,14 @@ class Cells(NamedTuple):
         k = self.names.index(column)
         return [row.fields[k] for row in self.rows]
 
-    def refusal(self, column: str, expected: str, row: int) -> ValueError:
+    def refusal(self, column: str, expected: str, row: int) -> InputError:
         """The error for one field."""
         field = self.texts(column)[row]
         if field == "":
             value = "an empty field"
         else:
             value = field if _NUMBER.fullmatch(field) and len(field) <= 40 else shown(field)
-        return ValueError(
+        return InputError(
             f"`{column}` must be {expected}, but row {self.rows[row].number} of {self.file} "
             f"has {value}."
         )
@@ -141,17 +141,17 @@ def cells_of(text: str, file: str) -> Cells:
     names = header.fields
     if len(names) == 1 and re.search(r"[;\t]", names[0]):
         mark = "semicolons" if ";" in names[0] else "tabs"
-        raise ValueError(
+        raise InputError(
             f"the fields of {file} must be separated by commas, but its header row has {mark}."
         )
     if all(_PLAIN_NUMBER.fullmatch(name) for name in names):
-        raise ValueError(
+        raise InputError(
             f"row 1 of {file} must be a header row with the names of the columns, "
             f"but has {shown(names[0])}."
         )
     for k, name in enumerate(names):
         if name and name in names[:k]:
-            raise ValueError(
+            raise InputError(
                 f"each column must occur once, but {file} has the column `{shortened_name(name)}` "
                 f"twice (columns {names.index(name) + 1} and {k + 1})."
             )
@@ -177,13 +177,13 @@ def _split(text: str, file: str) -> list[Row]:
             if stripped in ([], [""]):
                 blank = blank or number
             elif blank:
-                raise ValueError(
+                raise InputError(
                     f"blank lines are only allowed at the end, but row {blank} of {file} is blank."
                 )
             else:
                 rows.append(Row(number, stripped))
     except csv.Error as error:
-        raise ValueError(f"row {last + 1} of {file} is not valid CSV: {error}.") from error
+        raise InputError(f"row {last + 1} of {file} is not valid CSV: {error}.") from error
     if not rows:
-        raise ValueError(f"{file} is empty: a header row and rows of numbers are expected.")
+        raise InputError(f"{file} is empty: a header row and rows of numbers are expected.")
     return rows

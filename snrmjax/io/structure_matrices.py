@@ -22,7 +22,7 @@ from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.moving_base import MOTIONS, BaseMotion, base_motion
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.names import suggestion
-from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE
+from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE, InputError
 
 _MATRICES = ("mass", "stiffness", "damping")
 _SPARSE = ("data", "indices", "indptr", "row", "col", "offsets", "shape", "format")
@@ -46,16 +46,16 @@ def structure_of_matrices(
     if "file" in parts:
         for key in (*_MATRICES, "points"):
             if key in parts:
-                raise ValueError(f"{table.location} has both `file` and `{key}`.")
+                raise InputError(f"{table.location} has both `file` and `{key}`.")
         parts |= _arrays(folder / table.text("file"), table)
     in_files = [key for key in _MATRICES if isinstance(parts.get(key), str)]
     for key in in_files:
         parts[key] = _sparse_file(folder / table.text(key), key, table)
     if "damping" in parts and "damping_ratio" in parts:
-        raise ValueError(f"{table.location} has both `damping` and `damping_ratio`.")
+        raise InputError(f"{table.location} has both `damping` and `damping_ratio`.")
     for key in ("mass", "stiffness", *(() if in_files else ("points",))):
         if key not in parts:
-            raise ValueError(f"{table.location} lacks the key `{key}`.")
+            raise InputError(f"{table.location} lacks the key `{key}`.")
     matrices = {key: _matrix(key, parts[key], table) for key in _MATRICES if key in parts}
     points = parts.get("points", [f"x{k + 1}" for k in range(matrices["mass"].shape[0])])
     if not isinstance(points, list) or not all(isinstance(p, str) and p.strip() for p in points):
@@ -63,13 +63,13 @@ def structure_of_matrices(
     try:
         check_names(points, matrices["mass"].shape[0])
     except ValueError as error:
-        raise ValueError(f"{table.location} cannot be read: {error}") from error
+        raise InputError(f"{table.location} cannot be read: {error}") from error
     damping: Any = matrices.get("damping")
     if "damping_ratio" in parts:
         damping = table.number("damping_ratio", BELOW_ONE)
     base = moving_base(top, file)
     if base is not None and "force" in top.entries:
-        raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
+        raise InputError(f"{file} has both [force] and [base]: a force or a base that moves.")
     force = None if base else top.table("force", f"[force] of {file}")
     at = {} if force is None else _force(force)
     sensors, n_modes = listed_sensors(top, file), None
@@ -103,7 +103,7 @@ def structure_of_matrices(
             name=top.text("name", folder.stem),
         )
     except ValueError as error:
-        raise ValueError(f"{table.location} cannot be read: {error}") from error
+        raise InputError(f"{table.location} cannot be read: {error}") from error
     of_interest = top.whole("mode_of_interest", 1, 1)
     if of_interest > built.n_modes:
         raise top.refusal(
@@ -117,7 +117,7 @@ def _check_named(points: list[str], named: Iterable[str], location: str) -> None
     for point in named:
         if point not in points:
             near = suggestion(point, points) or f"; known are {', '.join(points[:12])}"
-            raise ValueError(
+            raise InputError(
                 f"{location} names the point {shown(point)}, which does not exist{near}."
             )
 
@@ -145,11 +145,11 @@ def unbalance(top: TomlTable, file: str) -> float | None:
         return None
     table = top.table("force", f"[force] of {file}")
     if "at" in table.entries:
-        raise ValueError(
+        raise InputError(
             f"{file} has `at` of [force] without [structure]: modes have participations."
         )
     if "base" in top.entries:
-        raise ValueError(f"{file} has both [force] and [base]: a force or a base that moves.")
+        raise InputError(f"{file} has both [force] and [base]: a force or a base that moves.")
     table.check_keys(("unbalance_kg_m",))
     return table.number("unbalance_kg_m", POSITIVE)
 
@@ -189,7 +189,7 @@ def _arrays(path: Path, table: TomlTable) -> dict[str, Any]:
         arrays = dict(reader(path))
     except _UNREADABLE as error:
         kind = f"an {path.suffix[1:].upper()} file of arrays (MAT up to version 7)"
-        raise ValueError(
+        raise InputError(
             f"{shown(path.name)} of {table.location} cannot be read: it is damaged or not {kind}; "
             "a sparse matrix, which `numpy.savez` stores as an object, needs its own file by "
             '`scipy.sparse.save_npz`, stated as `mass = "mass.npz"`.'
@@ -240,7 +240,7 @@ def _sparse_file(path: Path, key: str, table: TomlTable) -> Any:
     try:
         return scipy.sparse.load_npz(path)
     except _UNREADABLE as error:
-        raise ValueError(
+        raise InputError(
             f"`{key}` = {shown(path.name)} of {table.location} cannot be read: it is not a sparse "
             "matrix by `scipy.sparse.save_npz`."
         ) from error

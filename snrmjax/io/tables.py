@@ -38,6 +38,7 @@ from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
+from snrmjax.numerics.rules import InputError
 
 
 def read_steady_states(
@@ -78,7 +79,7 @@ def check_driven_alike(data: SteadyStates, modes: LinearModes, file: str) -> Non
     """Refuse an excitation other than the model's, or none of the mode of interest."""
     one = modes.mode_of_interest
     if not modes.driven()[one]:
-        raise ValueError(
+        raise InputError(
             f"{file} is a test of mode {one + 1}, the model's `mode_of_interest`, which its force "
             f"does not excite (`participation` {modes.participation.item(one):g}): expected "
             "another `mode_of_interest`, or the participation of this one."
@@ -86,13 +87,13 @@ def check_driven_alike(data: SteadyStates, modes: LinearModes, file: str) -> Non
     if (data.base is None) == (modes.base is None):
         return
     if modes.base is None:
-        raise ValueError(
+        raise InputError(
             f"{file} has the acceleration of a base, but the model has no [base]: add "
             '`[base]` with `motion = "absolute"` (or "relative") to it, participations then being '
             "those of the base's acceleration (`snrmjax modes --base` writes both)."
         )
     column = "drive_v" if np.isfinite(np.asarray(data.drive)).any() else "force_n"
-    raise ValueError(
+    raise InputError(
         f"{file} has `{column}`, but the model has base excitation ([base]): expected the "
         f"columns `{BASE[0]}` and `{BASE[1]}`."
     )
@@ -133,7 +134,7 @@ def _read(
         columns["force_n"] = unbalance * (HERTZ * columns["frequency_hz"]) ** 2
     velocity = _phasors(*(columns[name] for name in PHASOR))
     if not np.any(velocity):
-        raise ValueError(f"{file} has only zero velocities.")
+        raise InputError(f"{file} has only zero velocities.")
 
     names, sensor = _sensors(cells, sensors)
     force = "drive_v" if "drive_v" in columns else "force_n"
@@ -240,7 +241,7 @@ def _sensors(cells: Cells, sensors: tuple[str, ...] | None) -> tuple[tuple[str, 
     if not cells.has("sensor"):
         if sensors is not None and len(sensors) != 1:
             listed = ", ".join(f"`{name}`" for name in sensors)
-            raise ValueError(
+            raise InputError(
                 f"{cells.file} lacks the column `sensor`, which is required because the model "
                 f"has the sensors {listed}."
             )
@@ -253,7 +254,7 @@ def _sensors(cells: Cells, sensors: tuple[str, ...] | None) -> tuple[tuple[str, 
             raise cells.refusal("sensor", "the name of a sensor", row)
         if text not in index:
             listed = ", ".join(f"`{name}`" for name in names)
-            raise ValueError(
+            raise InputError(
                 f"`sensor` must be one of the model's ({listed}), but row "
                 f"{cells.rows[row].number} of {cells.file} has {shown(text)}"
                 f"{suggestion(text, names)}."
@@ -301,7 +302,7 @@ def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
     """The fields of a table of steady states by column, as text; `file` is its name in messages."""
     host: SteadyStates = jax.tree.map(np.asarray, as_recorded(data))
     if not np.all(np.any(host.measured, axis=1)):
-        raise ValueError("each steady state must be measured by a sensor, but one is by none.")
+        raise InputError("each steady state must be measured by a sensor, but one is by none.")
     state, sensor = np.nonzero(host.measured)
     columns: dict[str, list[str]] = {"level": [str(int(value)) for value in host.level[state]]}
     if host.sensors != UNNAMED_SENSOR:  # a model's only sensor may have another name
@@ -315,7 +316,7 @@ def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
     elif np.all(has_drive) and not np.any(has_force):
         columns["drive_v"] = _texts(host.drive[state])
     else:
-        raise ValueError(
+        raise InputError(
             "steady states to be written must have all forces or, where no force is known, all "
             "drive voltages."
         )
@@ -332,12 +333,12 @@ def _fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
     for k, order in enumerate(host.harmonic_order):
         harmonic = np.asarray(host.harmonics[state, sensor, k])
         if order == 0 and np.any(np.nan_to_num(harmonic.imag)):
-            raise ValueError("harmonic 0 is a mean and must be real, but has an imaginary part.")
+            raise InputError("harmonic 0 is a mean and must be real, but has an imaginary part.")
         for name, part in zip(harmonic_columns(order), ("real", "imag"), strict=False):
             columns[name] = _texts(getattr(harmonic, part))
     back = _read(_table_text(columns), file, host.sensors)
     if back.n_states != data.n_states or not np.array_equal(back.measured, host.measured):
-        raise ValueError(
+        raise InputError(
             f"{file} could not distinguish some steady states that have the same level, "
             "frequency and force, but different sensors: give each its own `order`."
         )
@@ -376,10 +377,10 @@ def write_table(
     fields = {}
     for name, values in columns.items():
         if isinstance(values, str):
-            raise ValueError(f"the column `{name}` must be a sequence of values, not a text.")
+            raise InputError(f"the column `{name}` must be a sequence of values, not a text.")
         items = values.tolist() if isinstance(values, np.ndarray | jax.Array) else values
         if not isinstance(items, Sequence):
-            raise ValueError(f"the column `{name}` must be a vector, but is one value.")
+            raise InputError(f"the column `{name}` must be a vector, but is one value.")
         fields[name] = [_field(name, value) for value in items]
     write_atomically(path, _table_text(fields))
 
@@ -393,14 +394,14 @@ def _field(name: str, value: object) -> str:
         return str(int(item))
     if isinstance(item, Real):
         return format(float(item) + 0.0, ".12g")  # adding zero turns -0 into 0
-    raise ValueError(f"the column `{name}` must hold real numbers or texts, but has {shown(item)}.")
+    raise InputError(f"the column `{name}` must hold real numbers or texts, but has {shown(item)}.")
 
 
 def _table_text(columns: Mapping[str, Sequence[str]]) -> str:
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"`{name}` {length}" for name, length in lengths.items())
-        raise ValueError(f"all columns of a table must have one length, but have {listed}.")
+        raise InputError(f"all columns of a table must have one length, but have {listed}.")
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from snrmjax.io.files import shown
 from snrmjax.numerics.names import suggestion
-from snrmjax.numerics.rules import Rule
+from snrmjax.numerics.rules import InputError, Rule
 
 
 def parsed_toml(text: str, file: str) -> "TomlTable":
@@ -14,11 +14,11 @@ def parsed_toml(text: str, file: str) -> "TomlTable":
     try:
         return TomlTable(tomllib.loads(text), file)
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{file} is not valid TOML: {error}.") from error
+        raise InputError(f"{file} is not valid TOML: {error}.") from error
     except ValueError as error:  # Python's limit on the digits of an integer
-        raise ValueError(f"{file} has a number of too many digits.") from error
+        raise InputError(f"{file} has a number of too many digits.") from error
     except RecursionError as error:
-        raise ValueError(f"{file} is not valid TOML: it nests too deeply.") from error
+        raise InputError(f"{file} is not valid TOML: it nests too deeply.") from error
 
 
 class TomlTable(NamedTuple):
@@ -27,9 +27,9 @@ class TomlTable(NamedTuple):
     entries: Mapping[str, object]
     location: str
 
-    def refusal(self, key: str, expected: str, value: object) -> ValueError:
+    def refusal(self, key: str, expected: str, value: object) -> InputError:
         """The error for one value."""
-        return ValueError(f"`{key}` must be {expected}, but {self.location} has {shown(value)}.")
+        return InputError(f"`{key}` must be {expected}, but {self.location} has {shown(value)}.")
 
     def check_keys(self, required: Iterable[str], optional: Iterable[str] = ()) -> None:
         """Refuse unknown keys and missing required ones."""
@@ -39,9 +39,9 @@ class TomlTable(NamedTuple):
         for key in self.entries:
             if key not in known:
                 near = suggestion(key, missing) or suggestion(key, known)
-                raise ValueError(f"{self.location} has the unknown key {shown(key)}{near}.")
+                raise InputError(f"{self.location} has the unknown key {shown(key)}{near}.")
         if missing:
-            raise ValueError(f"{self.location} lacks the key `{missing[0]}`.")
+            raise InputError(f"{self.location} lacks the key `{missing[0]}`.")
 
     def number(self, key: str, *rules: Rule, default: float | None = None) -> float:
         """A finite number that satisfies the rules."""
@@ -113,7 +113,7 @@ class TomlTable(NamedTuple):
         if value not in known:
             near = suggestion(value, known)
             if near:
-                raise ValueError(f"{self.location} has the unknown `{key}` {shown(value)}{near}.")
+                raise InputError(f"{self.location} has the unknown `{key}` {shown(value)}{near}.")
             raise self.refusal(key, f"one of {', '.join(known)}", value)
         return value
 
@@ -129,5 +129,5 @@ class TomlTable(NamedTuple):
         value = self.entries.get(key, [])
         if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
             given = f"[{key}]" if isinstance(value, dict) else shown(value)
-            raise ValueError(f"`{key}` must be tables under [[{key}]], but {file} has {given}.")
+            raise InputError(f"`{key}` must be tables under [[{key}]], but {file} has {given}.")
         return [TomlTable(entry, f"{key} {k + 1} of {file}") for k, entry in enumerate(value)]

@@ -15,6 +15,7 @@ from snrmjax.measure.states import (
     steady_states,
 )
 from snrmjax.model.moving_base import BaseMotion, base_motion
+from snrmjax.numerics.rules import InputError
 
 
 def base_excited_states(
@@ -55,13 +56,13 @@ def base_excited_states(
     recorded = np.asarray(velocity, dtype=complex)
     recorded = recorded[:, None] if recorded.ndim == 1 else recorded
     if load.shape != omega.shape or recorded.shape != (omega.size, len(sensors)):
-        raise ValueError(
+        raise InputError(
             f"`base_acceleration` must have shape {omega.shape} and `velocity` "
             f"{(omega.size, len(sensors))}, but have {load.shape} and {recorded.shape}."
         )
     if along is not None and not isinstance(along, Mapping):
         if np.shape(along) != (len(sensors),):
-            raise ValueError(f"`along` must have one number per sensor, {len(sensors)}.")
+            raise InputError(f"`along` must have one number per sensor, {len(sensors)}.")
         along = dict(zip(sensors, along, strict=True))
     angle = np.angle(load)
     rotated: OptionalColumns = {**columns}
@@ -93,7 +94,7 @@ def states_relative_to_base(data: SteadyStates, base: BaseMotion) -> SteadyState
     if base.motion == "relative":
         return dataclasses.replace(data, base=base)
     if np.any(np.asarray(data.phase_unknown)):
-        raise ValueError(
+        raise InputError(
             "the base motion cannot be subtracted from velocities without phases: measure the "
             "phases, or motion relative to the base."
         )

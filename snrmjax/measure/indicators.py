@@ -9,6 +9,7 @@ from jaxtyping import Array, Complex, Float
 from snrmjax.measure.signals import require_orders
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.rules import InputError
 
 
 def nnm_appropriation(
@@ -40,7 +41,7 @@ def nnm_appropriation(
     if amplitudes.ndim == 1:
         amplitudes = amplitudes[None]
     if amplitudes.ndim == 0 or amplitudes.shape[-1] != len(orders):
-        raise ValueError(
+        raise InputError(
             f"`velocity_amplitudes` must end in an axis of {len(orders)} harmonics, as many as "
             f"`orders` {orders} names, but has shape {jnp.shape(velocity_amplitudes)}."
         )

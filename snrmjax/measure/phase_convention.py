@@ -13,6 +13,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _LEAST_STATES = 6
 _NEAR = 0.2  # of a level's largest |V|/F, for a state to count as near resonance
@@ -198,10 +199,10 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
-class MisreadPhases(ValueError):
+class MisreadPhases(InputError):
     """Rejection of data with wrong phases by an analysis; `facts` are those of `wrong_phases`."""
 
-    def __init__(self, facts: tuple[Fact, ...], reason: ValueError) -> None:
+    def __init__(self, facts: tuple[Fact, ...], reason: InputError) -> None:
         super().__init__(f"{facts[0]} As the data are: {reason}")
         self.facts = facts
 
@@ -222,7 +223,7 @@ def naming_wrong_phases(verb: Callable[Arguments, Result]) -> Callable[Arguments
             result: Any = verb(*args, **kwargs)
         except MisreadPhases:  # raised by a nested analysis
             raise
-        except ValueError as error:
+        except InputError as error:
             if wrong:
                 raise MisreadPhases(wrong, error) from error
             raise

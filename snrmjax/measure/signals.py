@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.rules import InputError
 
 
 def synthesise(
@@ -133,7 +134,7 @@ def checked_amplitudes(
     """Amplitudes as a complex array; raises `ValueError` if `orders` does not match the columns."""
     values = jnp.asarray(amplitudes, dtype=complex)
     if values.ndim == 0 or values.shape[-1] != len(orders) or not orders:
-        raise ValueError(
+        raise InputError(
             f"`{name}` must end in an axis of {len(orders)} harmonics, as many as `orders` "
             f"{orders} names (one at least), but has shape {values.shape}."
         )
@@ -148,7 +149,7 @@ def require_orders(name: str, orders: Sequence[int] | Int[np.ndarray, " order"])
     given = tuple(np.asarray(orders).tolist()) if isinstance(orders, np.ndarray) else tuple(orders)
     whole = all(isinstance(order, int | np.integer) and order >= 0 for order in given)
     if not whole or len(set(given)) != len(given):
-        raise ValueError(f"`{name}` must be distinct whole numbers from 0 on, but is {given}.")
+        raise InputError(f"`{name}` must be distinct whole numbers from 0 on, but is {given}.")
     return tuple(int(order) for order in given)
 
 
@@ -156,5 +157,5 @@ def require_fundamental(name: str, orders: Sequence[int]) -> tuple[int, ...]:
     """As `require_orders`, for orders that must contain the fundamental, 1."""
     checked = require_orders(name, orders)
     if 1 not in checked:
-        raise ValueError(f"`{name}` must contain the fundamental, 1, but is {checked}.")
+        raise InputError(f"`{name}` must contain the fundamental, 1, but is {checked}.")
     return checked

@@ -14,6 +14,7 @@ from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.compiled import value_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import DEGREE, HERTZ
 
 PHASE_UNKNOWN = np.pi / 3
@@ -200,13 +201,13 @@ def steady_states(
     harmonic_order = tuple(int(order) for order in columns.get("harmonic_order", ()))
     omega = np.asarray(frequency, dtype=np.float64)
     if omega.ndim != 1:
-        raise ValueError(f"`frequency` must be a vector, but has shape {omega.shape}.")
+        raise InputError(f"`frequency` must be a vector, but has shape {omega.shape}.")
     n_states, n_sensors = omega.size, len(sensors)
 
     def per_state(name: str, value: object, dtype: type = np.float64) -> Any:
         array = np.full(n_states, np.nan) if value is None else np.asarray(value, dtype=dtype)
         if array.shape != (n_states,):
-            raise ValueError(f"`{name}` must have shape ({n_states},), but has {array.shape}.")
+            raise InputError(f"`{name}` must have shape ({n_states},), but has {array.shape}.")
         return array
 
     def per_sensor(name: str, value: object, dtype: type = np.float64) -> Any:
@@ -215,16 +216,16 @@ def steady_states(
         if array.ndim == 1 and n_sensors == 1:
             array = array[:, None]
         if array.shape != shape:
-            raise ValueError(f"`{name}` must have shape {shape}, but has {array.shape}.")
+            raise InputError(f"`{name}` must have shape {shape}, but has {array.shape}.")
         return array
 
     if harmonics is None:
         harmonics = np.zeros((n_states, n_sensors, 0), dtype=np.complex128)
         if harmonic_order:
-            raise ValueError("`harmonic_order` is given without `harmonics`.")
+            raise InputError("`harmonic_order` is given without `harmonics`.")
     recorded: Any = np.asarray(harmonics, dtype=np.complex128)
     if recorded.shape != (n_states, n_sensors, len(harmonic_order)):
-        raise ValueError(
+        raise InputError(
             f"`harmonics` must have shape {(n_states, n_sensors, len(harmonic_order))}, "
             f"but has {recorded.shape}."
         )
@@ -258,7 +259,7 @@ def check_phases(data: SteadyStates, purpose: str) -> None:
         return
     unknown = np.any(measured & (std >= _UNKNOWN_FROM), axis=1)
     if unknown.any():
-        raise ValueError(
+        raise InputError(
             f"{purpose} needs the phases of all velocities relative to the force, but those of "
             f"{int(unknown.sum())} of {data.n_states} steady states are unknown (`velocity_m_s` "
             f"in place of real and imaginary part, or `phase_std_deg` of "
@@ -273,8 +274,8 @@ def check_force(data: SteadyStates, purpose: str) -> None:
     if force is None or np.any(np.isfinite(force)):
         return
     if not np.any(np.isfinite(np.asarray(data.drive))):
-        raise ValueError(f"{purpose} needs the force, but no steady state has one.")
-    raise ValueError(
+        raise InputError(f"{purpose} needs the force, but no steady state has one.")
+    raise InputError(
         f"{purpose} needs the force in newtons, but only a drive voltage (`drive_v`) is given. Let "
         "a joint fit find the force per volt together with the curves: `--fit auto --free "
         'force_gain`, in Python `fit_jointly(data, modes, free=["force_gain"])`.'
@@ -298,19 +299,19 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
     for part in parts:
         tests += [part] if isinstance(part, SteadyStates) else _listed(part)
     if not tests:
-        raise ValueError("there is nothing to join: give one `SteadyStates` at least.")
+        raise InputError("there is nothing to join: give one `SteadyStates` at least.")
     for test in tests:
         if not isinstance(test, SteadyStates):
-            raise ValueError(
+            raise InputError(
                 f"`join_steady_states` joins `SteadyStates`, but got a `{type(test).__name__}`."
             )
         if test.sensors != tests[0].sensors:
-            raise ValueError(
+            raise InputError(
                 "tests can be joined when they have the same sensors, but one has "
                 f"{list(test.sensors)}, the first {list(tests[0].sensors)}."
             )
         if test.base != tests[0].base:
-            raise ValueError(
+            raise InputError(
                 "tests can be joined when they have the same excitation, but one has a force and "
                 "another a base acceleration, or their sensors record different motions."
             )

@@ -32,6 +32,7 @@ from snrmjax.methods.steady.rct import rct
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _log = logging.getLogger(__name__)
 
@@ -146,7 +147,7 @@ def compare_methods(
     names = list(known) if methods is None else list(methods)
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise ValueError(
+        raise InputError(
             f"`methods` must be among {', '.join(known)}, but has {', '.join(unknown)}."
         )
     sorting = _sorted([data] if isinstance(data, SteadyStates) else list(data), modes)
@@ -169,16 +170,16 @@ def compare_methods(
         else:
             try:
                 results.append(METHODS[name](sorting.states, modes))
-            except ValueError as error:
+            except (InputError, np.linalg.LinAlgError) as error:
                 stopped[name] = str(error)
     if sorting.unknown:  # methods without other data report why a record was rejected
         absent = dict.fromkeys(absent, sorting.unknown[-1])
     stopped = {name: f"{name}: {why}" for name, why in (stopped | absent).items()}
     if not results:
-        raise ValueError(f"no method could run; {next(iter(stopped.values()), 'none was given.')}")
+        raise InputError(f"no method could run; {next(iter(stopped.values()), 'none was given.')}")
     if not any(result.found.any() for result in results):
         why = MethodStatus(int(results[0].status[0])).message
-        raise ValueError(f"no method gave a point; {results[0].method}: {why}.")
+        raise InputError(f"no method gave a point; {results[0].method}: {why}.")
     return Comparison(
         tuple(results), stopped, sorting.states, sorting.facts(), sorting.interfering()
     )
@@ -220,7 +221,7 @@ def _sorted(parts: Sequence[SteadyStates | TimeRecording], modes: LinearModes) -
             continue
         try:
             sorting.tests.append(recorded_test(part, modes))
-        except ValueError as error:
+        except InputError as error:
             sorting.unknown.append(str(error))
             continue
         sorting.counts.append(None)
@@ -230,7 +231,7 @@ def _sorted(parts: Sequence[SteadyStates | TimeRecording], modes: LinearModes) -
             try:
                 of_record, sorting.counts[-1] = states_of(sorting.tests[-1])
                 states.append(of_record)
-            except ValueError as error:
+            except InputError as error:
                 sorting.without_states.append(str(error))
     if not states:
         return sorting

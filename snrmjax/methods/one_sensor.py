@@ -8,6 +8,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates
 from snrmjax.model.modes import LinearModes, reference_sensor
+from snrmjax.numerics.rules import InputError
 
 
 class SensorStates(NamedTuple):
@@ -58,7 +59,7 @@ def sensor_states(
     """
     name = modes.sensors[reference_sensor(modes)]
     if name not in data.sensors:
-        raise ValueError(
+        raise InputError(
             f"the sensor {name}, where the mode moves most, is needed, but the data have "
             f"{', '.join(data.sensors)}."
         )
@@ -70,10 +71,10 @@ def sensor_states(
     measured = np.asarray(data.measured)[:, at] & (np.abs(velocity) > 0)
     forced = measured & np.isfinite(force) & (force > 0)
     if not forced.any():
-        raise ValueError("forces in N are needed, but the data have none (force_n).")
+        raise InputError("forces in N are needed, but the data have none (force_n).")
     phased = forced & ~(phase_std >= PHASE_UNKNOWN * (1 - 1e-12))
     if not phased.any():
-        raise ValueError("phases are needed, but the data have amplitudes alone.")
+        raise InputError("phases are needed, but the data have amplitudes alone.")
     kept = np.flatnonzero(phased)
     sign = np.sign(signed_drive_point(modes))
     velocity_std = np.asarray(data.velocity_std)[kept, at] / np.abs(velocity[kept])

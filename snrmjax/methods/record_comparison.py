@@ -25,6 +25,7 @@ from snrmjax.methods.records.restoring_force import restoring_force
 from snrmjax.methods.result import MethodResult, method_result
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _LONGEST = 2**22  # samples of a record that these methods keep in memory
 
@@ -45,7 +46,7 @@ def states_of(test: RecordedTest) -> tuple[SteadyStates, Fact]:
     channels = test.channels
     force = channels.force or channels.drive
     if force is None:
-        raise ValueError(f"{test.recording.name} has no force.")
+        raise InputError(f"{test.recording.name} has no force.")
     drive = channels.drive if channels.force is not None else None
     settings: dict[str, Any] = {"sensors": channels.sensors, "drive": drive}
     try:
@@ -55,8 +56,8 @@ def states_of(test: RecordedTest) -> tuple[SteadyStates, Fact]:
             return states, Fact("steps_settled", n=states.n_states, n_steps=len(steps.status))
         states = sweep_states(test.recording, force, channels.motions, **settings).states
         return states, Fact("states_read", n=states.n_states)
-    except ValueError as error:
-        raise ValueError(f"{test.recording.name}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{test.recording.name}: {error}") from error
 
 
 def with_decays(test: RecordedTest, modes: LinearModes) -> RecordedTest:
@@ -93,14 +94,14 @@ def _restoring_force(test: RecordedTest, modes: LinearModes) -> list[MethodResul
 
 def _force_channel(test: RecordedTest) -> str:
     if test.channels.force is None:
-        raise ValueError("a forced record needs its force in N (force_n).")
+        raise InputError("a forced record needs its force in N (force_n).")
     return test.channels.force
 
 
 def _pnlss_of(tests: Sequence[RecordedTest], modes: LinearModes) -> MethodResult:
     """One model for all realisations and levels; the second largest is left for validation."""
     if len({(test.channels, test.recording.sampling_rate) for test in tests}) > 1:
-        raise ValueError("records of different channels or rates are fitted one by one.")
+        raise InputError("records of different channels or rates are fitted one by one.")
     force = _force_channel(tests[0])
     records = [test.recording for test in tests]
     if len(records) == 1:
@@ -154,15 +155,15 @@ def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearMod
     if method.together is not None and len(readable) > 1:
         try:
             results, read, readable = [method.together(readable, modes)], readable, []
-        except ValueError as error:
+        except (InputError, np.linalg.LinAlgError) as error:
             apart = [Fact("records_apart", why=str(error))]
     for test in readable:
         try:
             if test.recording.n_samples > _LONGEST:
-                raise ValueError(f"the record has more than {_LONGEST} samples: cut it.")
+                raise InputError(f"the record has more than {_LONGEST} samples: cut it.")
             results += method.run(test, modes)
             read.append(test)
-        except ValueError as error:
+        except (InputError, np.linalg.LinAlgError) as error:
             reasons.append(f"{error} ({test.recording.name})")
     if not results:
         return MethodRun(None, reasons[0])

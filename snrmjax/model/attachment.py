@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from snrmjax.numerics.rules import InputError
+
 InfluenceVector = tuple[tuple[str, float], ...]
 """Points with their weights b: a force acts on x = Σ b x_point and exerts b f on every point."""
 
@@ -29,13 +31,13 @@ def influence_vector(
         [(at, 1.0)] if isinstance(at, str) else list(at.items() if isinstance(at, Mapping) else at)
     )
     if not pairs:
-        raise ValueError("`at` must name at least one point, but is empty.")
+        raise InputError("`at` must name at least one point, but is empty.")
     influence: list[tuple[str, float]] = []
     for name, weight in pairs:
         if not isinstance(weight, float | int | np.number) or not 0 < abs(float(weight)) < np.inf:
-            raise ValueError(f"the weight of {name!r} in `at` must be a number, but is {weight!r}.")
+            raise InputError(f"the weight of {name!r} in `at` must be a number, but is {weight!r}.")
         if any(name == other for other, _ in influence):
-            raise ValueError(
+            raise InputError(
                 f"`at` names the point {name!r} twice: a force needs two different points."
             )
         influence.append((str(name), float(weight)))

@@ -29,6 +29,7 @@ from snrmjax.model.effect_metadata import (
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.nonsmooth_points import NonsmoothPoints, with_nonsmooth_points
 from snrmjax.model.potential import PolynomialPotential
+from snrmjax.numerics.rules import InputError
 
 Scalar = Float[Array, ""]
 Samples = Float[Array, " time"]
@@ -347,12 +348,12 @@ def checked_effects(effects: AbstractEffect | Iterable[AbstractEffect]) -> tuple
 def _with_arrays(effect: Any) -> Any:
     if isinstance(effect, type) and issubclass(effect, AbstractEffect):
         values = ", ".join(f"{name}=…" for name in effect.parameters())
-        raise ValueError(
+        raise InputError(
             f"`effects` has {effect.__name__}, which is a class: give its parameters, "
             f"`{effect.__name__}({values})`."
         )
     if not isinstance(effect, AbstractEffect):
-        raise ValueError(f"`effects` must be effects such as those of `EFFECTS`, not {effect!r}.")
+        raise InputError(f"`effects` must be effects such as those of `EFFECTS`, not {effect!r}.")
     plain = [
         name
         for name in effect.parameters()

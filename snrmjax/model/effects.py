@@ -59,7 +59,7 @@ from snrmjax.model.library.stiffness import (
     StaticPreload,
 )
 from snrmjax.numerics.kept_programs import keep_no_programs
-from snrmjax.numerics.rules import require
+from snrmjax.numerics.rules import InputError, require
 from snrmjax.numerics.units import unit_in_print
 
 
@@ -184,9 +184,9 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
     parameters.
     """
     if effect.kind in known_effects():
-        raise ValueError(f"an effect of the kind {effect.kind!r} is already registered.")
+        raise InputError(f"an effect of the kind {effect.kind!r} is already registered.")
     if not effect.parameters():
-        raise ValueError(f"{effect.kind!r} must have a parameter: a field without a default.")
+        raise InputError(f"{effect.kind!r} must have a parameter: a field without a default.")
     keep_no_programs()  # they would not distinguish this class from a later one of its name
     EFFECTS[effect.kind] = effect
     return effect
@@ -238,10 +238,10 @@ def make_effect(
     Array([  0., -18.], dtype=float64)
     """
     if kind not in known_effects():
-        raise ValueError(f"unknown effect kind {kind!r}; known are {sorted(known_effects())}.")
+        raise InputError(f"unknown effect kind {kind!r}; known are {sorted(known_effects())}.")
     wanted = effect_class(kind).parameters()
     if set(parameters) != set(wanted):
-        raise ValueError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")
+        raise InputError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")
     for name, value in parameters.items():
         require(f"`{name}` of {kind}", value, *wanted[name].rules)
     arrays = {k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()}
@@ -249,9 +249,9 @@ def make_effect(
     attachments = {"at": at, "normal_at": normal_at}
     given = {name: influence_vector(b) for name, b in attachments.items() if b is not None}
     if given and not issubclass(effect_class(kind), AbstractForce):
-        raise ValueError(f"{kind} is not a force: it cannot act at a point.")
+        raise InputError(f"{kind} is not a force: it cannot act at a point.")
     if normal_at is not None and kind not in SURFACES:
-        raise ValueError(f"{kind} has a single attachment: it takes no `normal_at`.")
+        raise InputError(f"{kind} has a single attachment: it takes no `normal_at`.")
     return effect_class(kind)(**arrays, **given)
 
 
@@ -263,12 +263,12 @@ def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:
         if parameter.entries is Entries.ONE:
             continue
         if value.ndim != 1 or value.shape[0] < 2:
-            raise ValueError(
+            raise InputError(
                 f"`{name}` of {kind} must be two numbers or more, one for every knot, but has the "
                 f"shape {value.shape}."
             )
         if shape and value.shape != shape:
-            raise ValueError(
+            raise InputError(
                 f"`{name}` of {kind} must have {shape[0]} numbers, one for every knot, but has "
                 f"{value.shape[0]}."
             )
@@ -277,7 +277,7 @@ def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:
             steps = np.diff(np.asarray(value))
             if np.any(steps <= 0):
                 first = int(np.argmax(steps <= 0))
-                raise ValueError(
+                raise InputError(
                     f"`{name}` of {kind} must rise from knot to knot, but has "
                     f"{float(value[first + 1]):g} after {float(value[first]):g}."
                 )

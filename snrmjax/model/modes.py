@@ -13,7 +13,7 @@ from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.result import AbstractShown
-from snrmjax.numerics.rules import BELOW_ONE, NOT_NEGATIVE, POSITIVE, require
+from snrmjax.numerics.rules import BELOW_ONE, NOT_NEGATIVE, POSITIVE, InputError, require
 from snrmjax.numerics.units import HERTZ
 
 _SHOWN = 12  # modes listed in a text
@@ -101,7 +101,7 @@ class LinearModes(AbstractShown):
             return self.point_shape[..., self.points.index(point), :]
         known = (*self.sensors, *self.points)
         near = suggestion(point, known) or f"; known are {', '.join(known[:_SHOWN])}"
-        raise ValueError(f"a force acts at {point!r}, where the modes have no shape{near}.")
+        raise InputError(f"a force acts at {point!r}, where the modes have no shape{near}.")
 
     def forced_at(self, point: str) -> "LinearModes":
         """The same modes driven by a force at this point instead.
@@ -111,14 +111,14 @@ class LinearModes(AbstractShown):
         """
         participation = self.shape_at(point)
         if self.base is not None:
-            raise ValueError(
+            raise InputError(
                 "the structure is driven by its base: its modes have no scale in newtons."
             )
         if not np.abs(participation[self.mode_of_interest]) > STILL * np.max(np.abs(participation)):
-            raise ValueError(f"a force at {point!r} does not excite the mode of interest.")
+            raise InputError(f"a force at {point!r} does not excite the mode of interest.")
         rigid = self.rigid_body_participation
         if rigid.size and point not in self.sensors:
-            raise ValueError(
+            raise InputError(
                 f"a force at {point!r} excites rigid-body modes, but has no sensor there."
             )
         if rigid.size:
@@ -137,7 +137,7 @@ class LinearModes(AbstractShown):
         """
         if sensor not in self.sensors:
             near = suggestion(sensor, self.sensors) or f"; known are {', '.join(self.sensors)}"
-            raise ValueError(f"the model does not have the sensor {sensor!r}{near}.")
+            raise InputError(f"the model does not have the sensor {sensor!r}{near}.")
         names = (sensor, *(name for name in self.sensors if name != sensor))
         order = np.array([self.sensors.index(name) for name in names])
         return dataclasses.replace(
@@ -235,20 +235,20 @@ def linear_modes(
     frequency = _vector("natural_frequency", natural_frequency)
     n_modes = frequency.size
     if n_modes == 0:
-        raise ValueError("`natural_frequency` must have at least one mode, but is empty.")
+        raise InputError("`natural_frequency` must have at least one mode, but is empty.")
     damping = _vector("damping_ratio", damping_ratio, n_modes)
     shape = _numbers(mode_shape)
     if shape.ndim != 2 or shape.shape[1] != n_modes or shape.shape[0] == 0:
-        raise ValueError(
+        raise InputError(
             f"`mode_shape` must have shape (sensors, {n_modes} modes), but has {shape.shape}."
         )
     require("`mode_shape`", shape)
     n_sensors = shape.shape[0]
     names = sensors or tuple(f"sensor {k + 1}" for k in range(n_sensors))
     if len(names) != n_sensors:
-        raise ValueError(f"`sensors` names {len(names)} sensors, but `mode_shape` has {n_sensors}.")
+        raise InputError(f"`sensors` names {len(names)} sensors, but `mode_shape` has {n_sensors}.")
     if not 0 <= mode_of_interest < n_modes:
-        raise ValueError(
+        raise InputError(
             f"`mode_of_interest` must lie between 0 and {n_modes - 1}, but is {mode_of_interest}."
         )
     require("`natural_frequency`", frequency, NOT_NEGATIVE)
@@ -257,7 +257,7 @@ def linear_modes(
     shapes, participations = rigid_body or RigidBodyModes(np.zeros((n_sensors, 0)), [])
     rigid_shape = _numbers(shapes)
     if rigid_shape.ndim != 2 or rigid_shape.shape[0] != n_sensors:
-        raise ValueError(
+        raise InputError(
             f"`rigid_body.shape` must have shape ({n_sensors} sensors, rigid-body modes), "
             f"but has {rigid_shape.shape}."
         )
@@ -281,7 +281,7 @@ def linear_modes(
     points = optional.points or {}
     for name in points:
         if name in names:
-            raise ValueError(f"`beside.points` has {name!r}, which is a sensor.")
+            raise InputError(f"`beside.points` has {name!r}, which is a sensor.")
     if points:
         shapes_there = [_vector(f"beside.points[{k!r}]", s, n_modes) for k, s in points.items()]
         numbers["point_shape"] = _numbers(shapes_there)
@@ -296,7 +296,7 @@ def linear_modes(
         require("`beside.unbalance`", optional.unbalance, POSITIVE)
         numbers["unbalance"] = _numbers(optional.unbalance)
     if optional.base is not None and optional.unbalance is not None:
-        raise ValueError("a base and an unbalance cannot both drive a structure.")
+        raise InputError("a base and an unbalance cannot both drive a structure.")
     modes = LinearModes(
         **numbers,
         sensors=tuple(names),
@@ -312,9 +312,9 @@ def _check_base(base: BaseMotion, points: tuple[str, ...], rigid: Any) -> None:
     for point, _ in base.along:
         if point not in points:
             near = suggestion(point, points) or f"; known are {', '.join(points[:_SHOWN])}"
-            raise ValueError(f"the base's `along` names {point!r}, which is not a point{near}.")
+            raise InputError(f"the base's `along` names {point!r}, which is not a point{near}.")
     if np.size(rigid):
-        raise ValueError("with base excitation there are no rigid-body modes, but some are given.")
+        raise InputError("with base excitation there are no rigid-body modes, but some are given.")
 
 
 def _numbers(value: Any) -> Any:
@@ -328,7 +328,7 @@ def _coupling(damping: Any, n_modes: int) -> Any:
     matrix = _numbers(damping)
     require("`beside.damping_coupling`", matrix)
     if matrix.shape != (n_modes, n_modes):
-        raise ValueError(
+        raise InputError(
             f"`beside.damping_coupling` must have shape ({n_modes}, {n_modes}), but has "
             f"{matrix.shape}."
         )
@@ -340,7 +340,7 @@ def _vector(name: str, value: object, size: int | None = None) -> Any:
     require(f"`{name}`", vector)
     if vector.ndim != 1 or (size is not None and vector.size != size):
         wanted = "a vector" if size is None else f"a vector of {size}"
-        raise ValueError(f"`{name}` must be {wanted}, but has shape {vector.shape}.")
+        raise InputError(f"`{name}` must be {wanted}, but has shape {vector.shape}.")
     return vector
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.numerics.names import suggestion
+from snrmjax.numerics.rules import InputError
 
 SensorMotion = Literal["absolute", "relative"]
 MOTIONS: tuple[SensorMotion, ...] = get_args(SensorMotion)
@@ -56,12 +57,12 @@ def base_motion(
     """
     if motion not in MOTIONS:
         near = suggestion(str(motion), MOTIONS)
-        raise ValueError(
+        raise InputError(
             f"`motion` of a base must be 'absolute' or 'relative', but is {motion!r}{near}."
         )
     pairs = tuple((str(point), float(value)) for point, value in (along or {}).items())
     if not all(np.isfinite(value) for _, value in pairs):
-        raise ValueError("`along` of a base must have finite numbers.")
+        raise InputError("`along` of a base must have finite numbers.")
     return BaseMotion(motion, pairs)
 
 

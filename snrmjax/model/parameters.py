@@ -14,7 +14,7 @@ from snrmjax.model.attachment import unit_at
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, POSITIVE, InputError, Rule
 
 _MODE_RULES = {
     "natural_frequency": (POSITIVE,),
@@ -51,16 +51,16 @@ def checked_names(
     """
     known = parameter_names(model)
     if isinstance(names, str) or not names:
-        raise ValueError(f"`{subject}` must be a sequence of names, but is {names!r}.")
+        raise InputError(f"`{subject}` must be a sequence of names, but is {names!r}.")
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=5, cutoff=0.5) or known[:5]
-            raise ValueError(
+            raise InputError(
                 f"`{subject}` names {name!r}, which the model does not have; similar ones are "
                 f"{', '.join(near)}."
             )
         if list(names).count(name) > 1:
-            raise ValueError(f"`{subject}` names {name!r} twice.")
+            raise InputError(f"`{subject}` names {name!r} twice.")
     return tuple(names)
 
 

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from snrmjax.numerics.rules import InputError
+
 Monomial = tuple[int, ...]
 
 
@@ -103,7 +105,7 @@ def polynomial_potential(
     spread = _by_monomial(coefficient_std or {}, n_modes)
     unknown = set(spread) - set(values)
     if unknown:
-        raise ValueError(f"`coefficient_std` names {sorted(unknown)}, which have no coefficient.")
+        raise InputError(f"`coefficient_std` names {sorted(unknown)}, which have no coefficient.")
     monomials = tuple(sorted(values, key=lambda m: (len(m), m)))
     return PolynomialPotential(
         coefficient=jax.device_put(np.array([values[m] for m in monomials], float)),
@@ -120,9 +122,9 @@ def _by_monomial(
     for key, value in numbers.items():
         monomial = parse_monomial(key, n_modes)
         if monomial in values:
-            raise ValueError(f"monomial {key!r} is given twice (the order of modes is free).")
+            raise InputError(f"monomial {key!r} is given twice (the order of modes is free).")
         if not np.isfinite(value):
-            raise ValueError(f"the number of monomial {key!r} must be finite, but is {value}.")
+            raise InputError(f"the number of monomial {key!r} must be finite, but is {value}.")
         values[monomial] = float(value)
     return values
 
@@ -132,14 +134,14 @@ def parse_monomial(key: str | Monomial, n_modes: int) -> Monomial:
     if isinstance(key, str):
         parts = key.split("-") if "-" in key else list(key)
         if not all(part.isascii() and part.isdigit() for part in parts):
-            raise ValueError(f'monomial {key!r} must be mode numbers, such as "112" for q1^2 q2.')
+            raise InputError(f'monomial {key!r} must be mode numbers, such as "112" for q1^2 q2.')
         indices = [int(part) - 1 for part in parts]
     else:
         indices = [operator.index(index) for index in key]
     if len(indices) < 2:
-        raise ValueError(f"monomial {key!r} must have degree 2 or more.")
+        raise InputError(f"monomial {key!r} must have degree 2 or more.")
     if not all(0 <= index < n_modes for index in indices):
-        raise ValueError(
+        raise InputError(
             f"monomial {key!r} names a mode that does not exist (there are {n_modes})."
         )
     return tuple(sorted(indices))

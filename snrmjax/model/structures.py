@@ -27,6 +27,7 @@ from snrmjax.model.modes import LinearModes, have_values
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractShown
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import unit_in_print
 
 _FLAT = 1e-9  # of the largest tangent stiffness at rest, below which it counts as zero
@@ -269,7 +270,7 @@ def structure(
     if potential is None:
         potential = polynomial_potential({}, modes.n_modes)
     if potential.n_modes != modes.n_modes:
-        raise ValueError(
+        raise InputError(
             f"`potential` is for {potential.n_modes} modes, but `modes` has {modes.n_modes}."
         )
     made = checked_effects(effects)

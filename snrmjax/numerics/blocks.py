@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Int, Shaped
 from threadpoolctl import ThreadpoolController
 
+from snrmjax.numerics.rules import InputError
+
 P = ParamSpec("P")
 T = TypeVar("T")
 R = TypeVar("R")
@@ -93,7 +95,7 @@ def stacked(trees: Sequence[T]) -> T:
     for number, (array, rest) in enumerate(zip(arrays, fixed, strict=True)):
         same = (jax.tree.structure(array), rest) == first
         if not same or [np.shape(leaf) for leaf in jax.tree.leaves(array)] != shapes:
-            raise ValueError(
+            raise InputError(
                 f"models of a batch must have the same modes, monomials and effects, but number "
                 f"{number} differs from the first in more than numbers."
             )

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from snrmjax.numerics.kept_programs import NotKept, ProgramKeeper, program_keeper
+from snrmjax.numerics.rules import InputError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -137,7 +138,7 @@ def on_numbers(instead: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
         def call(*arguments: P.args, **named: P.kwargs) -> R:
             leaves = jax.tree.leaves((arguments, named))
             if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-                raise ValueError(
+                raise InputError(
                     f"`{function.__name__}` works on numbers, and cannot be called inside "
                     f"`jax.grad`, `jax.jit` or `jax.vmap` with what these vary. {instead}"
                 )
@@ -177,7 +178,7 @@ def jitted(function: Callable[P, R]) -> Callable[P, R]:
 def _in_double_precision() -> None:
     """Raises `ValueError` if JAX was switched to single precision: no solver would converge."""
     if not jax.config.read("jax_enable_x64"):
-        raise ValueError(
+        raise InputError(
             "JAX computes in single precision: `jax_enable_x64`, which `import snrmjax` switches "
             'on, was switched off. Switch it on: `jax.config.update("jax_enable_x64", True)`.'
         )

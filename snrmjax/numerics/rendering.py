@@ -7,6 +7,8 @@ modules that render them.
 import importlib
 from typing import Any
 
+from snrmjax.numerics.rules import InputError
+
 _modules: dict[str, str] = {}
 
 
@@ -37,5 +39,5 @@ def drawn(result: Any, **settings: Any) -> Any:
 
 def _module(what: str) -> Any:
     if what not in _modules:
-        raise ValueError(f"no {what} are registered: `import snrmjax` registers them.")
+        raise InputError(f"no {what} are registered: `import snrmjax` registers them.")
     return importlib.import_module(_modules[what])

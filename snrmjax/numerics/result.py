@@ -10,6 +10,7 @@ import numpy as np
 
 from snrmjax.numerics import rendering
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import DEGREE, HERTZ
 
@@ -161,7 +162,7 @@ class AbstractResult(AbstractShown):
         data = self.to_xarray()
         if len(data.sizes) != 1:
             dimensions = ", ".join(str(name) for name in data.sizes) or "none"
-            raise ValueError(
+            raise InputError(
                 f"`{type(self).__name__}` has these dimensions: {dimensions}. A table has one:"
                 " use `.to_xarray()`."
             )

@@ -6,6 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 
+class InputError(ValueError):
+    """Refusal of an input that is wrong or cannot be answered, with a message that says why.
+
+    Whatever else is raised, a `ValueError` of NumPy or JAX too, is an error of this package.
+    """
+
+
 class Rule(NamedTuple):
     """A condition on a number or on every entry, and its wording in a message."""
 
@@ -50,4 +57,4 @@ def require(subject: str, value: Any, *rules: Rule) -> None:
         if len(bad):
             index = tuple(bad[0].tolist())
             entry = f"entry {index[0] if len(index) == 1 else index} is" if index else "is"
-            raise ValueError(f"{subject} must be {rule.expected}, but {entry} {entries[index]:g}.")
+            raise InputError(f"{subject} must be {rule.expected}, but {entry} {entries[index]:g}.")

@@ -34,6 +34,7 @@ from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import InputError
 
 _MEASURED = (
     *(".csv", ".uff", ".unv", ".unv58", ".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf"),
@@ -71,7 +72,7 @@ class NamedStates(NamedTuple):
         if self.names_no_sensor and len(modes.sensors) == 1:
             states = dataclasses.replace(states, sensors=modes.sensors)
         if states.sensors != modes.sensors:
-            raise ValueError(
+            raise InputError(
                 f"{self.file} has the sensors {', '.join(self.states.sensors)}, but the model "
                 f"{', '.join(modes.sensors)}."
             )
@@ -138,7 +139,7 @@ def read_test_files(
     whose columns are neither recognised nor assigned in a `map.toml`.
     """
     if not folder.is_dir():
-        raise ValueError(f"{folder} must be a folder with the files of a test.")
+        raise InputError(f"{folder} must be a folder with the files of a test.")
     files = sorted(one for one in folder.iterdir() if one.is_file() and one.name[0] != ".")
     models = [] if model is None else [model]
     own = [file for file in files if file.name == MAP]
@@ -205,12 +206,12 @@ def read_test_files(
     notes = [f"{', '.join(named)}: {line}" for line, named in assumed_of.items()]
     if len(models) > 1:
         listed = " and ".join(model.name for model in models)
-        raise ValueError(
+        raise InputError(
             f"which is the model of this test, {listed}? Choose it by `--model {models[0].name}`."
         )
     if not states and not responses and not records:
         over = "; ".join(f"{name}: {why}" for name, why in passed[:_MOST_NAMED])
-        raise ValueError(
+        raise InputError(
             f"{folder.name} has no measurements: steady states (CSV), frequency responses or "
             f"time records{f' ({over})' if over else ''}."
         )
@@ -231,7 +232,7 @@ def _measured_text(path: Path, mapping: ImportMap) -> LaboratoryFile | None:
     """A text file of measurements, with a frequency or time column; None for any other."""
     try:
         content = read_laboratory_file(path, mapping.text_format, mapping.even_axis)
-    except ValueError:
+    except InputError:
         return None  # notes are shown unchanged
     axes = {table.role(name) for table in content.tables for name in table.columns}
     named = mapping.frequency in {name for table in content.tables for name in table.columns}
@@ -286,13 +287,13 @@ def _imported(
 ) -> Imported:
     try:
         return import_files(paths, mapping)
-    except ValueError as error:
+    except InputError as error:
         if map_file:
             names = ", ".join(path.name for path in paths)
-            raise ValueError(
+            raise InputError(
                 f"{names}, read with {map_file}: {error} (Its keys have the options' names.)"
             ) from error
-        raise ValueError(f"{_question(paths, folder)} (Without a map: {error})") from error
+        raise InputError(f"{_question(paths, folder)} (Without a map: {error})") from error
 
 
 def _question(paths: Sequence[Path], folder: Path) -> str:
@@ -315,7 +316,7 @@ def _linear(content: LaboratoryFile, path: Path) -> tuple[FrequencyResponses, ..
     """Responses of a linear test, that is of one level."""
     levels = {level for level in content.levels if np.isfinite(level)}
     if len(levels) > 1:
-        raise ValueError(
+        raise InputError(
             f"are the responses of {content.name}, of {len(levels)} levels, steady states of a "
             f"stepped sine? If so, run `snrmjax import {path} --force-amplitude z --out DIR`, "
             f"and put its {MAP} next to the file; for linear modes keep only the lowest level."

@@ -31,6 +31,7 @@ from snrmjax.identify.prediction.resonance_distribution import notes_on_negative
 from snrmjax.measure.states import SteadyStates, check_force, check_phases
 from snrmjax.model.structures import Structure, driven_in_newtons
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import COUPLED_MODES, IdentifyOptions, checked
 from snrmjax.pipelines.predictions import (
     Note,
@@ -111,7 +112,7 @@ def identify_test(
     """
     options = checked(dataclasses.replace(options or IdentifyOptions(), **settings))
     if model.modes.unbalance is not None and (options.predict_force or options.predict_drive):
-        raise ValueError(
+        raise InputError(
             "predictions are for a force in N that is the same at every frequency, but the model's "
             "[force] is an unbalance: remove `unbalance_kg_m` to predict for a force."
         )
@@ -119,7 +120,7 @@ def identify_test(
     if options.predict_drive:
         require_drive(data)
     if (options.modes or 1) > COUPLED_MODES:
-        raise ValueError(f"`--modes` must be 1 or 2, but is {options.modes}.")
+        raise InputError(f"`--modes` must be 1 or 2, but is {options.modes}.")
     coupled, alone = options.modes == COUPLED_MODES, options
     if coupled:  # responses are then those of the coupled modes
         alone = dataclasses.replace(options, predict_force=())
@@ -146,7 +147,7 @@ def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -
             measure=options.measure,
             n_knots=options.knots,
         )
-    except ValueError as error:
+    except InputError as error:
         raise with_caveat(error, data, model) from error
     backbone = identification.backbone
     predictions = predictions_of_points(identification, model, options)
@@ -166,7 +167,7 @@ def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -
 def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:
     names = (options.fit or "auto").split(",")
     if len(names) > 2:
-        raise ValueError(
+        raise InputError(
             f"--fit takes one or two families, but {options.fit!r} names {len(names)}."
         )
     fitted = functools.partial(

@@ -13,6 +13,7 @@ from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import InputError
 
 _STATES = {"level", "frequency_hz"}  # columns of which a table of steady states has one
 _NOT_CSV = (".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf", ".tdms", ".uff", ".unv", ".58")
@@ -33,7 +34,7 @@ def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyState
             return [read_steady_states(path, structure)]
     content = read_laboratory_file(path)
     if not content.recordings:
-        raise ValueError(
+        raise InputError(
             f"{file_name(path)} holds no time record (a CSV needs the column time_s) and no table "
             "of steady states (level, frequency_hz, …)."
         )

@@ -33,6 +33,7 @@ from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.moving_base import SensorMotion, base_motion
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import ModesOptions, checked, flag_of
 
 ModalFit = LinearModalFit | DecayModes
@@ -91,7 +92,7 @@ def find_linear_modes(
         fitted, notes = find_modes(sources, **fit, progress=progress)
     except GrowingModes as error:
         way = "leave `--conjugated` out" if options.conjugated else "state `--conjugated`"
-        raise ValueError(f"{str(error).rstrip('.')}: {way}.") from error
+        raise InputError(f"{str(error).rstrip('.')}: {way}.") from error
     second = None if with_mass is None else find_modes(_as_stated(with_mass, options), **fit)[0]
     scaled = scale_modes(
         fitted,
@@ -131,7 +132,7 @@ def _refuse_unused(options: ModesOptions, sources: ModalSources) -> None:
     for field in dataclasses.fields(options):
         stated = getattr(options, field.name) != field.default
         if stated and field.name in _UNUSED[kind]:
-            raise ValueError(
+            raise InputError(
                 f"`{flag_of(field)}` has no effect on modes from {_WORDS[kind]}: leave it out."
             )
 
@@ -152,7 +153,7 @@ def read_modal_sources(
             f"{path.name} holds {_WORDS[type(one)]}"
             for path, one in zip(paths, sources, strict=True)
         )
-        raise ValueError(f"files of one test must be of one kind, but {listed}.")
+        raise InputError(f"files of one test must be of one kind, but {listed}.")
     if isinstance(sources[0], FrequencyResponses):
         return joined_responses([one for one in sources if isinstance(one, FrequencyResponses)])
     if isinstance(sources[0], SteadyStates):
@@ -190,7 +191,7 @@ def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording
             if c.quantity == "force"
         ]
         if forces:
-            raise ValueError(
+            raise InputError(
                 f"{file_name(path)} holds time records with a force ({forces[0]}): modes need "
                 "frequency responses of them, or records of a decay without a force."
             )
@@ -199,7 +200,7 @@ def _read(path: Path) -> FrequencyResponses | SteadyStates | tuple[TimeRecording
             dataclasses.replace(record, name=path.name, notes=(*record.notes, *open_rates))
             for record in content.recordings
         )
-    raise ValueError(
+    raise InputError(
         f"{file_name(path)} holds neither frequency responses nor records nor our table of steady "
         "states: `snrmjax import` lists its content, and a map assigns its columns."
     )
@@ -215,9 +216,9 @@ def _sensor_values(option: str, words: Sequence[str]) -> dict[str, float]:
         except ValueError:
             name = ""
         if not name:
-            raise ValueError(f"{option} must be a sensor and a number as tip=0.2, but is {word!r}.")
+            raise InputError(f"{option} must be a sensor and a number as tip=0.2, but is {word!r}.")
         if name in values:
-            raise ValueError(f"{option} names the sensor {name} twice.")
+            raise InputError(f"{option} names the sensor {name} twice.")
         values[name] = number
     return values
 
@@ -236,7 +237,7 @@ def _requested_scale(options: ModesOptions, with_mass: ModalFit | None) -> Scale
             or options.mass_at is None
             or not isinstance(with_mass, LinearModalFit)
         ):
-            raise ValueError(
+            raise InputError(
                 "an added mass needs its mass in kg, the sensor at it, and frequency responses of "
                 "a second test with it."
             )
@@ -248,7 +249,7 @@ def _requested_scale(options: ModesOptions, with_mass: ModalFit | None) -> Scale
     for name, value in _sensor_values("--known-shape", known).items():
         ways["a known shape"] = KnownShape(name, value)
     if len(ways) > 1:
-        raise ValueError(f"one scale of the shapes is needed, but there are {' and '.join(ways)}.")
+        raise InputError(f"one scale of the shapes is needed, but there are {' and '.join(ways)}.")
     return next(iter(ways.values()), drive)
 
 
@@ -259,6 +260,6 @@ def _poles(text: str | None) -> tuple[float, ...] | None:
     try:
         return tuple(float(word) * HERTZ for word in text.split(","))
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             f"--poles must be frequencies in Hz with commas between them, but is {text!r}."
         ) from error

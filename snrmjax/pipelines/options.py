@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
+from snrmjax.numerics.rules import InputError
+
 Options = TypeVar("Options")
 
 FILES = "Files"
@@ -53,16 +55,16 @@ def checked(options: Options) -> Options:
         flag, value = flag_of(fields[name]), getattr(options, name)
         for number in value if isinstance(value, Sequence) else (value,):
             if about.positive and not 0 < number < float("inf"):
-                raise ValueError(
+                raise InputError(
                     f"`{flag}` must be above zero, but is {number:g} {about.positive}."
                 )
             if about.least is not None and not number >= about.least:
-                raise ValueError(f"`{flag}` must be at least {about.least:g}, but is {number:g}.")
+                raise InputError(f"`{flag}` must be at least {about.least:g}, but is {number:g}.")
         if about.needs and not stated & set(about.needs):
-            raise ValueError(f"`{flag}` {about.why_needed}, or leave it out.")
+            raise InputError(f"`{flag}` {about.why_needed}, or leave it out.")
         excluding = [f"`{flag_of(fields[one])}`" for one in about.alone if one in stated]
         if excluding:
-            raise ValueError(
+            raise InputError(
                 f"`{flag}` has no effect with {' and '.join(excluding)}: {about.why_alone}; leave "
                 "one of them out."
             )

@@ -31,6 +31,7 @@ from snrmjax.identify.prediction.resonance_distribution import (
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import IdentifyOptions
 
 Note = Fact | str
@@ -148,7 +149,7 @@ def _of_distribution(
 def require_drive(data: SteadyStates) -> None:
     """Raise `ValueError` for data whose force is known in newtons."""
     if np.any(np.isfinite(np.asarray(data.force))):
-        raise ValueError(
+        raise InputError(
             "`--predict-drive` is for data with a drive voltage (`drive_v`), but these have the "
             "force in newtons (`force_n`): use `--predict-force`."
         )
@@ -197,7 +198,7 @@ def _day_of(options: IdentifyOptions) -> DayToDay | None:
     except (TypeError, ValueError):
         day = DayToDay(-1.0)
     if not all(0 <= each < 1 for each in day):
-        raise ValueError(
+        raise InputError(
             "`--day-std` takes up to three relative standard deviations from 0 to below 1, "
             f"FREQUENCY,DAMPING,GAIN as 0.001,0.05,0.02, but is {options.day_std!r}."
         )

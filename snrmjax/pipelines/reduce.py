@@ -25,6 +25,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.options import ReduceOptions, checked
 
 _SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # times the loads of single modes, for the model's range
@@ -107,11 +108,11 @@ def _refuse_contradictions(source: ReductionSource, condensation: Condensation) 
         return
     for warning in condensation.warnings:
         if warning.kind == "inconsistent_case":
-            raise ValueError(f"{warning}; correct or remove it.")
+            raise InputError(f"{warning}; correct or remove it.")
     ratio = condensation.quality.linear_stiffness_ratio
     worst = int(np.argmax(np.abs(np.nan_to_num(ratio, nan=1.0) - 1)))
     if abs(ratio[worst] - 1) > _REFUSED_LINEAR:
-        raise ValueError(
+        raise InputError(
             f"the load cases show {ratio[worst]:.4g} times the squared natural frequency of mode "
             f"{condensation.basis.numbers[worst]} as linear stiffness: units, loads, shapes and "
             "frequencies are inconsistent."
@@ -132,14 +133,14 @@ def _stated_scale_compared(source: ReductionSource, condensation: Condensation) 
         condensation.quality.misfit,
     )
     if misfit > _MEANINGLESS:
-        raise ValueError(
+        raise InputError(
             f"with {stated} the misfit of the potential is {100 * misfit:.0f} % of the nonlinear "
             "force of its own load cases, so that the model is not valid: leave the key out for "
             "the default scale."
         )
     try:
         displacement, cases = run_load_cases(source._replace(load_scale=None))
-    except ValueError as error:
+    except InputError as error:
         why = str(error)
         return [Fact("load_scale_not_compared", stated=source.load_scale, why=why)]
     chosen = reduced_model(source.basis, cases, degree=source.degree)
@@ -158,7 +159,7 @@ def _stated_scale_compared(source: ReductionSource, condensation: Condensation) 
         chosen=scale,
     )
     if abs(change[worst]) > _MEANINGLESS:
-        raise ValueError(f"{fact}: leave the key out, or state a smaller scale.")
+        raise InputError(f"{fact}: leave the key out, or state a smaller scale.")
     return [fact]
 
 
@@ -174,7 +175,7 @@ def read_reduction_source(
     given = [name for name, path in sources.items() if path is not None]
     if len(given) != 1:
         listed = " and ".join(given) or "none of them"
-        raise ValueError(f"`rom` needs one of BEAM, --tables and --calculix, but has {listed}.")
+        raise InputError(f"`rom` needs one of BEAM, --tables and --calculix, but has {listed}.")
     if options.tables is not None:
         return read_load_tables(options.tables)
     if beam is not None:
@@ -188,5 +189,5 @@ def _mode_numbers(modes: str | None) -> tuple[int, ...]:
     numbers = [int(part) for part in parts if part.isdecimal() and int(part) > 0]
     if len(numbers) < len(parts) or len(set(numbers)) < len(numbers):
         given = "not given" if modes is None else repr(modes)
-        raise ValueError(f"`--modes` must be different mode numbers such as 1,3,5, but is {given}.")
+        raise InputError(f"`--modes` must be different mode numbers such as 1,3,5, but is {given}.")
     return tuple(numbers)

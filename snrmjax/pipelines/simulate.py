@@ -12,6 +12,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.parameters import checked_names, parameter_values
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonic_balance import resonant_modes
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.event_equations import FORCE, EventKind
@@ -84,9 +85,9 @@ def simulate_responses(
     for `follow` without `to` or vice versa, and as `check_quasi_periodic` does.
     """
     if follow and to is None:
-        raise ValueError("`to` must be given with `follow`: the value that the parameter goes to.")
+        raise InputError("`to` must be given with `follow`: the value that the parameter goes to.")
     if not follow and (to is not None or parameter != FORCE):
-        raise ValueError("`parameter` and `to` must be given with `follow`, the kinds of events.")
+        raise InputError("`parameter` and `to` must be given with `follow`, the kinds of events.")
     if quasi_periodic:
         check_quasi_periodic(simulated_structure(model))
     if follow and parameter != FORCE:
@@ -121,7 +122,7 @@ def simulate_responses(
     if not any(len(curve.frequency) for curve in curves):
         stuck = [str(note) for note in notes if note.kind == "held_by_friction"]
         why = f": {stuck[0]}" if stuck else "; start farther from resonance."
-        raise ValueError(f"no response was computed in this range{why}")
+        raise InputError(f"no response was computed in this range{why}")
     estimates = [np.max(c.truncation, initial=0.0) for c in curves if c.truncation is not None]
     fraction = float(max(estimates, default=0.0))
     if fraction > _TRUNCATED:
@@ -155,7 +156,7 @@ def _tori(
         where = {"force": curve.force, "frequency_hz": frequency / HERTZ}
         try:
             branch = quasi_periodic_branch(model, curve, int(k), within=ends)
-        except ValueError as error:  # of this point alone
+        except InputError as error:  # of this point alone
             notes.append(Fact("torus_not_followed", **where, why=str(error)))
             continue
         if len(branch.frequency) < 2:
@@ -199,7 +200,7 @@ def simulate_mode(
     """
     linear = model.modes.natural_frequency.item(model.modes.mode_of_interest) / HERTZ
     if np.isclose(to_hz, linear, rtol=1e-12):
-        raise ValueError(f"`--to-hz` must differ from the linear frequency, {linear:g} Hz.")
+        raise InputError(f"`--to-hz` must differ from the linear frequency, {linear:g} Hz.")
     branch = nonlinear_normal_mode(model, to_hz * HERTZ, harmonic_order=harmonics, tongues=tongues)
     notes = [
         *_notes_on_equilibria(model),

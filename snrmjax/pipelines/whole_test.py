@@ -32,6 +32,7 @@ from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, reco
 from snrmjax.model.moving_base import base_motion
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.check import files_of_test, is_certain, with_imports
 from snrmjax.pipelines.diagnose import DiagnosedTest, diagnose_test
 from snrmjax.pipelines.folded_records import FoldedRecord, folded_records
@@ -101,7 +102,7 @@ def run_whole_test(
     stage.ends("files")
     model, modes = files.model, None
     if model is not None and options.base is not None:
-        raise ValueError(
+        raise InputError(
             f"`--base` has no effect with {files.model_file}, whose [base] states what the sensors "
             "record: leave it out."
         )
@@ -118,7 +119,7 @@ def run_whole_test(
     tables = [table.of_model(model) for table in files.states]
     parts = with_levels_apart([*tables, *(each.steps.states for each in stepped)])
     if not parts:
-        raise ValueError(
+        raise InputError(
             f"{name} holds no steady states and no record of a stepped sine: it determines only "
             "linear modes, as written by `snrmjax modes`."
         )
@@ -203,7 +204,7 @@ def _linear_modes(files: TestFiles, options: WholeTestOptions) -> LinearModesFou
     elif files.states:
         source = join_steady_states(with_levels_apart([table.states for table in files.states]))
     else:
-        raise ValueError(
+        raise InputError(
             "what are the linear modes? The folder has only time records: put a model.toml or "
             "frequency responses into it."
         )
@@ -220,12 +221,12 @@ def _linear_modes(files: TestFiles, options: WholeTestOptions) -> LinearModesFou
 def _scaled(fitted: ModalFit, by: DrivePoint) -> ScaledModes:
     try:
         return scale_modes(fitted, by)
-    except ValueError as error:
+    except InputError as error:
         if by.sensor is None:
             way = "Answer by `--drive-point SENSOR`, or write"
         else:
             way = f"Name another sensor than {by.sensor}, or write"
-        raise ValueError(
+        raise InputError(
             f"how are the mode shapes scaled? {error} {way} the model by `snrmjax "
             "modes`, which has further ways, into this folder."
         ) from error
@@ -242,10 +243,10 @@ def _nearest_mode(scaled: ScaledModes, files: TestFiles) -> int:
 def _sorted(named: NamedRecord, model: Structure) -> RecordedTest:
     try:
         return recorded_test(dataclasses.replace(named.record, name=named.file), model.modes)
-    except ValueError as error:
+    except InputError as error:
         if any(channel.quantity in _MOTIONS for channel in named.record.channels):
             raise
-        raise ValueError(
+        raise InputError(
             f"{error} `snrmjax import {named.file}` lists its content and how to import it; "
             "put the map.toml that the import writes into the folder."
         ) from error
@@ -261,7 +262,7 @@ def _refuse_doubled(names: Sequence[str], parts: Sequence[SteadyStates]) -> None
         apart = np.max(np.abs(first[:, :, None] - second[:, None, :]), axis=0)
         same = int(np.sum(apart.min(axis=0) < _ALIKE))
         if same >= max(_FEWEST_ALIKE, min(one.n_states, two.n_states) / 2):
-            raise ValueError(
+            raise InputError(
                 f"which of {a} and {b} is the test? Both hold the same {same} steady states, which "
                 "would count twice: move one of them out of the folder."
             )
@@ -272,7 +273,7 @@ def _steps(named: NamedRecord, test: RecordedTest) -> SteppedRecord:
     channels = test.channels
     force = channels.force or channels.drive
     if force is None:
-        raise ValueError(f"{named.file} is a stepped sine, but has no channel of force or drive.")
+        raise InputError(f"{named.file} is a stepped sine, but has no channel of force or drive.")
     steps = stepped_sine_states(
         named.record,
         force,
@@ -303,7 +304,7 @@ def _stop_at_errors(checkup: Checkup) -> None:
         f"{other.advice}"
         for other in others
     )
-    raise ValueError(
+    raise InputError(
         f"is this intended? {first.name} in {first.where}: {first.evidence} To correct "
         f"it: {first.advice}{more} To continue nevertheless: `--go-on`."
     )
@@ -328,7 +329,7 @@ def _identified(data: SteadyStates, model: Structure) -> tuple[IdentifiedTest, t
         if identified.joint is not None and outlying_states(identified.joint.fit).size:
             identified = identify_test(data, model, fit="auto", free=free, robust=True)
         return identified, ()
-    except ValueError as error:
+    except InputError as error:
         if drive_only:
             raise
         return identify_test(data, model), (Fact("no_joint_fit", why=str(error)),)

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.io.units import HERTZ
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.figures import diagnosis as diagnosis_figures
 from snrmjax.report.figures import identification as figures
 from snrmjax.report.figures import joint_fit as joint_figures
@@ -30,7 +31,7 @@ def plot_result(result: object, **settings: Any) -> Figure:
     for one in type(result).__mro__:
         if one.__name__ in _FIGURES:
             return _FIGURES[one.__name__](result, **settings)
-    raise ValueError(f"there is no figure of a `{type(result).__name__}`; see `sj.plot`.")
+    raise InputError(f"there is no figure of a `{type(result).__name__}`; see `sj.plot`.")
 
 
 def _states(states: Any, *, sensor: str | None = None) -> Figure:

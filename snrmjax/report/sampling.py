@@ -8,6 +8,7 @@ from jax.typing import ArrayLike
 from snrmjax.identify.pointwise.prediction import PredictedResponse
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.continuation.response_curve import (
     MotionCurve,
     ResponseCurve,
@@ -163,7 +164,7 @@ def phase_of(velocity: Any, backbone: "Backbone") -> np.ndarray:
 def sensor_index(sensors: tuple[str, ...], name: str) -> int:
     """Index of a sensor, or a `ValueError` that lists the sensors."""
     if name not in sensors:
-        raise ValueError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
+        raise InputError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
     return sensors.index(name)
 
 

@@ -22,6 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from snrmjax.io.files import FilePath, file_name, write_atomically
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.continuation.stability import Stability
 
 PAGE, COLUMN = 7.2, 4.8  # inches: a figure of several panels, and of one
@@ -109,7 +110,7 @@ def save_figure(path: FilePath, figure: Figure, *, dots_per_inch: float = 220.0)
     Raises `ValueError` when `path` does not end in .png or cannot be written.
     """
     if not file_name(path).lower().endswith(".png"):
-        raise ValueError(f"`path` must end in .png, but is {file_name(path)}.")
+        raise InputError(f"`path` must end in .png, but is {file_name(path)}.")
     write_atomically(path, png_bytes(figure, dots_per_inch=dots_per_inch))
 
 

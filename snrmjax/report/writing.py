@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from snrmjax.io.files import FilePath
+from snrmjax.numerics.rules import InputError
 
 _unfinished: list[Callable[[], None]] = []  # how to remove each folder that is being written
 # By the names of classes: no page is imported before there is a result of it.
@@ -32,7 +33,7 @@ def page_of(result: object) -> ModuleType:
     """The page module of a pipeline's result, with `write` and `headline`."""
     name = _PAGES.get(type(result).__name__)
     if name is None:
-        raise ValueError(
+        raise InputError(
             f"a `{type(result).__name__}` has no files; results of pipelines have: "
             f"{', '.join(_PAGES)}."
         )
@@ -56,13 +57,13 @@ def staged(out: Path) -> Iterator[Path]:
     """A folder to write into whose files move to `out` together, or not at all."""
     out = Path(os.path.abspath(out))
     if out.exists() and not out.is_dir():
-        raise ValueError(f"--out {out} is a file, but a folder is expected.")
+        raise InputError(f"--out {out} is a file, but a folder is expected.")
     made = [p for p in (out, *out.parents) if not p.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
         staging = Path(tempfile.mkdtemp(prefix=".snrmjax-", dir=out))
     except OSError as error:
-        raise ValueError(f"--out {out} cannot be written: {error.strerror}.") from error
+        raise InputError(f"--out {out} cannot be written: {error.strerror}.") from error
     done = False
 
     def discard() -> None:

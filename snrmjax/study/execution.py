@@ -27,6 +27,7 @@ from threadpoolctl import threadpool_limits
 import snrmjax.model
 from snrmjax.io.programs.compilation_cache import WORTH_KEEPING, default_cache_folder
 from snrmjax.io.programs.effect_files import load_effects, loaded_effects
+from snrmjax.numerics.rules import InputError
 from snrmjax.study.computations.base import COMPLETE, Failure, MemberStatus, joined, with_refused
 from snrmjax.study.store import StudyFolder, write_chunk
 from snrmjax.study.study import Ensemble
@@ -146,20 +147,20 @@ def dask_cluster(address: str) -> Workers:
     effects of a file, which its workers do not load.
     """
     if loaded_effects():
-        raise ValueError(
+        raise InputError(
             "a Dask cluster's workers do not load the files of `--effects`: run the study by "
             "shards, or make your effects a package that every worker imports."
         )
     try:
         import distributed
     except ImportError as error:
-        raise ValueError(
+        raise InputError(
             "a Dask cluster needs the package distributed: pip install 'snrmjax[cluster]'."
         ) from error
     try:
         client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
-        raise ValueError(f"no Dask scheduler answers at {address}.") from error
+        raise InputError(f"no Dask scheduler answers at {address}.") from error
     client_errors = (distributed.comm.CommClosedError, distributed.client.FutureCancelledError)
     return Workers(
         lambda: client.get_executor(pure=False),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from snrmjax.io.files import shown
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.rules import InputError
 from snrmjax.study.execution import (
     Workers,
     available_cores,
@@ -93,7 +94,7 @@ def open_study(path: str | os.PathLike[str]) -> "xarray.Dataset":
     folder = StudyFolder(Path(path))
     if stored_description(folder) is None:
         state = "is not complete" if folder.work.exists() else "does not exist"
-        raise ValueError(f"the study {path} {state}: run it (again) first.")
+        raise InputError(f"the study {path} {state}: run it (again) first.")
     return xarray.open_zarr(path, chunks=None, consolidated=True)
 
 
@@ -124,11 +125,11 @@ def run_study(
     Not differentiable: derivatives by what varies: `snrmjax.study.response_quantities`.
     """
     if processes is not None and processes < 1:
-        raise ValueError(f"`processes` must be at least 1, but is {processes}.")
+        raise InputError(f"`processes` must be at least 1, but is {processes}.")
     if processes is not None and scheduler is not None:
-        raise ValueError("`processes` are of this machine: a scheduler has its own.")
+        raise InputError("`processes` are of this machine: a scheduler has its own.")
     if not 1 <= shard[0] <= shard[1]:
-        raise ValueError(f"a shard i/n needs i from 1 to n, but is {shard[0]}/{shard[1]}.")
+        raise InputError(f"a shard i/n needs i from 1 to n, but is {shard[0]}/{shard[1]}.")
     ensemble = study.ensemble()
     described = description(study)
     folder = StudyFolder(Path(os.path.abspath(out)))
@@ -192,7 +193,7 @@ def _claim(folder: StudyFolder, described: dict) -> None:
             for key, (here, there) in list(other.items())[:_SHOWN]
         ]
         further = f" (and {len(other) - _SHOWN} more)" if len(other) > _SHOWN else ""
-        raise ValueError(
+        raise InputError(
             f"{folder.out} holds another study: {'; '.join(each)}{further}. Choose another --out, "
             "or restore that study."
         )
@@ -211,7 +212,7 @@ def _locked(folder: StudyFolder, shard: tuple[int, int]) -> Iterator[None]:
     try:
         lock = FileLock(folder.work / name, timeout=0).acquire()
     except Timeout as error:
-        raise ValueError(
+        raise InputError(
             f"another process is at work on {folder.out}: wait until it ends."
         ) from error
     with lock:
@@ -228,7 +229,7 @@ def _disk_errors(folder: StudyFolder) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ValueError(
+        raise InputError(
             f"{folder.out} cannot be written: {error.strerror or error}. Completed chunks are "
             "kept; the same command continues."
         ) from error

@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.numerics.rules import InputError
 from snrmjax.study.variations import AbstractVariation
 
 Method = Literal["grid", "list", "latin_hypercube", "sobol", "random", "saltelli"]
@@ -30,9 +31,9 @@ class Sampling(eqx.Module):
     def __check_init__(self) -> None:
         """Raises `ValueError` for an unknown method and for `members` below one."""
         if self.method not in get_args(Method):
-            raise ValueError(f"`method` must be one of {', '.join(get_args(Method))}.")
+            raise InputError(f"`method` must be one of {', '.join(get_args(Method))}.")
         if self.members is not None and self.members < 1:
-            raise ValueError(f"`members` must be at least 1, but is {self.members}.")
+            raise InputError(f"`members` must be at least 1, but is {self.members}.")
 
 
 def number_of_members(variations: Sequence[AbstractVariation], sampling: Sampling) -> int:
@@ -43,24 +44,24 @@ def number_of_members(variations: Sequence[AbstractVariation], sampling: Samplin
     if sampling.method in ("grid", "list"):
         n = _counted_by_values(variations, sampling)
         if sampling.members not in (None, n):
-            raise ValueError(
+            raise InputError(
                 f"a {sampling.method} of these values has {n} members, but `members` is "
                 f"{sampling.members}: leave it out."
             )
     elif sampling.members is None:
-        raise ValueError(f"the method {sampling.method} needs `members`, the number of samples.")
+        raise InputError(f"the method {sampling.method} needs `members`, the number of samples.")
     else:
         n = sampling.members
     if sampling.method == "saltelli":
         a_row = len(variations) + 2
         rows, rest = divmod(n, a_row)
         if rest or rows < FEWEST_ROWS or rows & (rows - 1):
-            raise ValueError(
+            raise InputError(
                 f"saltelli needs {a_row} times a power of two of members (the quantities and two "
                 f"more), {a_row * FEWEST_ROWS} at least, but has {n}."
             )
     if n > MOST_MEMBERS:
-        raise ValueError(f"a study has at most {MOST_MEMBERS:.0e} members, but this has {n:.3g}.")
+        raise InputError(f"a study has at most {MOST_MEMBERS:.0e} members, but this has {n:.3g}.")
     return n
 
 
@@ -69,18 +70,18 @@ def _counted_by_values(variations: Sequence[AbstractVariation], sampling: Sampli
     for variation in variations:
         values = variation.grid()
         if values is None:
-            raise ValueError(
+            raise InputError(
                 f"a {sampling.method} needs values, but {', '.join(variation.names)} has a "
                 "distribution: give `values`, or a `range` with `points`, or another method."
             )
         counts[variation.names[0]] = len(values)
     if not counts:
-        raise ValueError(f"a {sampling.method} needs at least one quantity that varies.")
+        raise InputError(f"a {sampling.method} needs at least one quantity that varies.")
     if sampling.method == "grid":
         return math.prod(counts.values())
     if len(set(counts.values())) > 1:
         each = ", ".join(f"{name} {n}" for name, n in counts.items())
-        raise ValueError(f"a list needs equally many values of each quantity, but has: {each}.")
+        raise InputError(f"a list needs equally many values of each quantity, but has: {each}.")
     return next(iter(counts.values()))
 
 

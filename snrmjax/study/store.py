@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.io.files import write_atomically
+from snrmjax.numerics.rules import InputError
 from snrmjax.study.computations.base import MEMBER, TEXT, Output, joined
 from snrmjax.study.identity import differences
 from snrmjax.study.study import FORCE, Ensemble
@@ -70,7 +71,7 @@ def read_study_plan(folder: StudyFolder) -> dict[str, Any] | None:
     try:
         return dict(json.loads(folder.plan.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
-        raise ValueError(
+        raise InputError(
             f"{folder.plan} is damaged: remove {folder.work} to compute the study anew."
         ) from error
 
@@ -117,7 +118,7 @@ def stored_description(folder: StudyFolder) -> dict[str, Any] | None:
         attributes = json.loads((folder.out / ".zattrs").read_text(encoding="utf-8"))
         return dict(json.loads(attributes["study"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(
+        raise InputError(
             f"{folder.out} is no data set of a study: choose another --out."
         ) from error
 

@@ -23,7 +23,7 @@ from snrmjax.model.parameters import (
 )
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
-from snrmjax.numerics.rules import POSITIVE, Rule
+from snrmjax.numerics.rules import POSITIVE, InputError, Rule
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.study.computations.base import (
     FORCE,
@@ -101,9 +101,9 @@ class Study(eqx.Module):
         not use, for too many members, and for the first inadmissible value.
         """
         if self.seed < 0:
-            raise ValueError(f"`seed` must be zero or positive, but is {self.seed}.")
+            raise InputError(f"`seed` must be zero or positive, but is {self.seed}.")
         if self.members_a_chunk is not None and self.members_a_chunk < 1:
-            raise ValueError(
+            raise InputError(
                 f"`members_a_chunk` must be at least 1, but is {self.members_a_chunk}."
             )
         _check_names(self)
@@ -193,14 +193,14 @@ def _check_names(study: Study) -> None:
     names = study.names
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"{name} varies twice.")
+            raise InputError(f"{name} varies twice.")
     given = {name: _in_model(name)[0] for name in names if name != FORCE}
     known = (*parameter_names(study.model), FORCE)
     if study.model_of is None:
         for name, in_model in given.items():
             if in_model not in known:
                 near = difflib.get_close_matches(name, known, n=3, cutoff=0.5) or known[:3]
-                raise ValueError(
+                raise InputError(
                     f"the model does not have the parameter {name!r}; similar ones are "
                     f"{', '.join(near)}."
                 )
@@ -208,17 +208,17 @@ def _check_names(study: Study) -> None:
         for in_model in given.values():
             check_beam_name(study.model_of.stated, in_model, study.model_of.file, known)
         if {RADIUS, RISE} <= set(given):
-            raise ValueError(f"{RADIUS} and {RISE} cannot both vary: one follows from the other.")
+            raise InputError(f"{RADIUS} and {RISE} cannot both vary: one follows from the other.")
     if _of_model(study) and len(set(given.values())) < len(given):
         (twice, _), *_ = Counter(given.values()).most_common(1)
-        raise ValueError(f"{twice} varies twice, in rad/s and in Hz.")
+        raise InputError(f"{twice} varies twice, in rad/s and in Hz.")
     forces = getattr(study.computation, "forces", None)
     stated = forces is not None and forces.values is not None
     if FORCE in names and (forces is None or stated):
         why = "`forces_n` is given too" if stated else f"{study.computation.kind} has no one force"
-        raise ValueError(f"{FORCE} cannot vary: {why}.")
+        raise InputError(f"{FORCE} cannot vary: {why}.")
     if forces is not None and not stated and FORCE not in names:
-        raise ValueError(f"{study.computation.kind} needs `forces_n`, or {FORCE} to vary.")
+        raise InputError(f"{study.computation.kind} needs `forces_n`, or {FORCE} to vary.")
 
 
 def _check_sensor(study: Study) -> None:
@@ -226,7 +226,7 @@ def _check_sensor(study: Study) -> None:
     if requested not in (None, used):
         kind = study.computation.kind
         instead = f"uses {used}, where the mode of interest moves most"
-        raise ValueError(
+        raise InputError(
             f"`sensor` cannot be {requested}: {kind} {instead if used else 'uses no sensor'}."
         )
 
@@ -237,7 +237,7 @@ def _check_values(study: Study, table: Float[np.ndarray, "member name"]) -> None
         for rule in _rules(study, name):
             bad = np.flatnonzero([not rule.good(value) for value in values.tolist()])
             if bad.size:
-                raise ValueError(
+                raise InputError(
                     f"{name} must be {rule.expected}, but member {bad[0]} of the study has "
                     f"{values[bad[0]]:g} ({bad.size} of {len(values)} members have such a value): "
                     "narrow its range, or take a distribution that stays inside, such as lognormal."
@@ -267,7 +267,7 @@ def _check_unit(study: Study, name: str, values: np.ndarray) -> None:
     middle = float(np.median(values))
     if not 1 / _STRANGE < middle / stated < _STRANGE:
         wanted = "Hz" if unit != 1.0 else "rad/s"
-        raise ValueError(
+        raise InputError(
             f"{name} is in {wanted}, {stated:.6g} in the model, but its values are about "
             f"{middle:.6g}: are they in the other unit?"
         )

@@ -14,7 +14,7 @@ from snrmjax.io.tables import read_steady_states
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE
+from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, InputError
 from snrmjax.simulate.virtual_test.recording import MeasurementErrors
 from snrmjax.study.computations.base import AbstractComputation, OfForces
 from snrmjax.study.computations.modes import DampedModes, NormalModes
@@ -59,7 +59,7 @@ def read_study(path: FilePath) -> Study:
     top = parsed_toml(read_text(path), file)
     kind = top.choice("compute", _KEYS) if "compute" in top.entries else None
     if kind is None:
-        raise ValueError(f"{file} lacks the key `compute`, one of {', '.join(_KEYS)}.")
+        raise InputError(f"{file} lacks the key `compute`, one of {', '.join(_KEYS)}.")
     needed, possible = _KEYS[kind]
     # Also refuses a key of another computation.
     top.check_keys(("model", "compute", *needed), (*possible, *_EVERY))
@@ -81,8 +81,8 @@ def read_study(path: FilePath) -> Study:
     )
     try:
         study.ensemble()
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
     return study
 
 
@@ -99,7 +99,7 @@ def _variation(table: TomlTable) -> AbstractVariation:
     if "parameters" in table.entries:
         return _joint(table)
     if "parameter" not in table.entries:
-        raise ValueError(f"{table.location} lacks the key `parameter`.")
+        raise InputError(f"{table.location} lacks the key `parameter`.")
     return _single(table)
 
 
@@ -109,8 +109,8 @@ def _made(
     """A variation; its errors are reported with the table's location."""
     try:
         return kind(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{table.location} cannot be read: {error}") from error
+    except InputError as error:
+        raise InputError(f"{table.location} cannot be read: {error}") from error
 
 
 def _single(table: TomlTable) -> AbstractVariation:
@@ -118,7 +118,7 @@ def _single(table: TomlTable) -> AbstractVariation:
     ways = [key for key in ("values", "range", "distribution") if key in table.entries]
     if len(ways) != 1:
         given = " and ".join(f"`{key}`" for key in ways) or "none of them"
-        raise ValueError(
+        raise InputError(
             f"{table.location} ({name[0]}) needs one of `values`, `range`, `distribution`, but has "
             f"{given}."
         )
@@ -176,7 +176,7 @@ def _computation(
         return Identifications(data) if kind == "identify" else Diagnoses(data)
     ends = [top.number(key, POSITIVE) for key in _RANGE]
     if not ends[0] < ends[1]:
-        raise ValueError(
+        raise InputError(
             f"`from_hz` must be below `to_hz`, but {top.location} has {ends[0]:g} and {ends[1]:g}."
         )
     within = ResponseRange(
@@ -187,7 +187,7 @@ def _computation(
     if forces is None and not varied and model.modes.unbalance is not None:
         forces = np.ones(1)
     if forces is None and not varied:
-        raise ValueError(f"{top.location} lacks the key `forces_n`, and {FORCE} does not vary.")
+        raise InputError(f"{top.location} lacks the key `forces_n`, and {FORCE} does not vary.")
     if kind == "virtual_test":
         levels = np.zeros(0) if forces is None else forces
         per_level = top.whole("points_per_level", 1, 5)

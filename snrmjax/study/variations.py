@@ -15,7 +15,7 @@ from snrmjax.identify.calibrate.backbone_calibration import BackboneCalibration
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.model.parameters import parameter_values, stated_stds
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.rules import POSITIVE
+from snrmjax.numerics.rules import POSITIVE, InputError
 
 _FEWEST, _MOST = 2, 10_000_000  # values of a range
 _NORMAL_LIMIT = 1e-12  # samples of the unit interval are clipped to this distance from 0 and 1
@@ -57,11 +57,11 @@ class AbstractVariation(eqx.Module):
         title = ", ".join(self.names)
         for key, value in vars(self).items():
             if key != "names" and value is not None and not np.all(np.isfinite(_array(value))):
-                raise ValueError(f"`{key}` of {title} must be finite, but is {value}.")
+                raise InputError(f"`{key}` of {title} must be finite, but is {value}.")
         for key in positive:
             if not POSITIVE.good(getattr(self, key)):
                 given = f"{getattr(self, key):g}"
-                raise ValueError(f"`{key}` of {title} must be {POSITIVE.expected}, but is {given}.")
+                raise InputError(f"`{key}` of {title} must be {POSITIVE.expected}, but is {given}.")
 
 
 class Discrete(AbstractVariation):
@@ -76,12 +76,12 @@ class Discrete(AbstractVariation):
     def __check_init__(self) -> None:
         """Raises `ValueError`."""
         if not self.values.size:
-            raise ValueError(f"`values` of {self.names[0]} must have at least one number.")
+            raise InputError(f"`values` of {self.names[0]} must have at least one number.")
         self._check()
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
         """Raises `ValueError`: listed values have no derivative."""
-        raise ValueError(f"{self.names[0]} takes listed values: derivatives need a distribution.")
+        raise InputError(f"{self.names[0]} takes listed values: derivatives need a distribution.")
 
     def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
         """Each value on an equal part of the unit interval."""
@@ -110,9 +110,9 @@ class Uniform(AbstractVariation):
         name, points = self.names[0], self.points
         if not self.low < self.high:
             ends = f"{self.low:g} to {self.high:g}"
-            raise ValueError(f"the range of {name} must rise, but goes from {ends}.")
+            raise InputError(f"the range of {name} must rise, but goes from {ends}.")
         if points is not None and not _FEWEST <= points <= _MOST:
-            raise ValueError(f"`points` of {name} must be from {_FEWEST} to {_MOST}, not {points}.")
+            raise InputError(f"`points` of {name} must be from {_FEWEST} to {_MOST}, not {points}.")
 
     def at(self, z: Any, xp: ModuleType = jnp) -> Any:
         """By the normal distribution function."""
@@ -178,7 +178,7 @@ class MultivariateNormal(AbstractVariation):
         """Raises `ValueError`."""
         title, n, variance = ", ".join(self.names), len(self.names), self.covariance
         if self.mean.shape != (n,) or variance.shape != (n, n):
-            raise ValueError(
+            raise InputError(
                 f"the joint normal of {title} needs {n} means and a covariance of {n} by {n}, but "
                 f"has {self.mean.shape} and {variance.shape}."
             )
@@ -186,16 +186,16 @@ class MultivariateNormal(AbstractVariation):
         k = int(np.argmin(np.diag(variance)))
         if variance[k, k] < 0:
             value = f"{variance[k, k]:g}"
-            raise ValueError(
+            raise InputError(
                 f"the variance of {self.names[k]} must not be negative, but is {value}."
             )
         scale = _scale(variance)
         correlation = variance / np.outer(scale, scale)
         if not np.allclose(correlation, correlation.T, rtol=0, atol=_ROUNDING):
-            raise ValueError(f"the covariance of {title} must be symmetric, but is not.")
+            raise InputError(f"the covariance of {title} must be symmetric, but is not.")
         smallest = np.linalg.eigvalsh(correlation)[0]
         if smallest < -_ROUNDING * n:
-            raise ValueError(
+            raise InputError(
                 f"the covariance of {title} must be positive semidefinite, but the smallest "
                 f"eigenvalue of its correlations is {smallest:.3g}."
             )
@@ -215,7 +215,7 @@ def stated_variations(model: Structure) -> tuple[Normal, ...]:
     """
     values, stds = parameter_values(model), stated_stds(model)
     if not stds:
-        raise ValueError("the model states no standard deviation of its parameters.")
+        raise InputError("the model states no standard deviation of its parameters.")
     return tuple(Normal((name,), values[name], std) for name, std in stds.items())
 
 
@@ -225,7 +225,7 @@ def posterior_variation(calibrated: CalibratedModel | BackboneCalibration) -> Mu
     Raises `ValueError` for a calibration that did not converge.
     """
     if not calibrated.converged:
-        raise ValueError(
+        raise InputError(
             f"the calibration did not converge ({calibrated.status}): its covariance is not valid."
         )
     return MultivariateNormal(calibrated.names, calibrated.values, calibrated.covariance)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.model.modes import have_values
-from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, Rule
+from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, InputError, Rule
 
 Number = float | Float[Array, ""]
 SupportName = Literal["clamped", "pinned", "free"]
@@ -33,9 +33,9 @@ def _check(part: eqx.Module, rule: Rule, *names: str) -> None:
         if value is None or not have_values(value):
             continue
         if np.ndim(value):
-            raise ValueError(f"`{name}` must be one number, but has shape {np.shape(value)}.")
+            raise InputError(f"`{name}` must be one number, but has shape {np.shape(value)}.")
         if not (np.isfinite(value) and rule.good(value)):
-            raise ValueError(f"`{name}` must be {rule.expected}, but is {float(value):g}.")
+            raise InputError(f"`{name}` must be {rule.expected}, but is {float(value):g}.")
 
 
 class Support(eqx.Module):
@@ -70,7 +70,7 @@ def _support(value: Support | SupportName) -> Support:
     if isinstance(value, Support):
         return value
     if value not in _NAMED:
-        raise ValueError(f"a support must be one of {', '.join(_NAMED)}, but is {value!r}.")
+        raise InputError(f"a support must be one of {', '.join(_NAMED)}, but is {value!r}.")
     return _NAMED[value]
 
 
@@ -84,7 +84,7 @@ class PointMass(eqx.Module):
     def __check_init__(self) -> None:
         """Raises `ValueError` for a position off the beam or a negative mass."""
         if not 0 <= self.at <= 1:
-            raise ValueError(f"`at` must be a fraction of the length, but is {self.at:g}.")
+            raise InputError(f"`at` must be a fraction of the length, but is {self.at:g}.")
         _check(self, NOT_NEGATIVE, "mass", "inertia")
 
 
@@ -119,9 +119,9 @@ class Beam(eqx.Module):
     def __check_init__(self) -> None:
         """Raises `ValueError` for invalid dimensions."""
         if isinstance(self.elements, bool) or not isinstance(self.elements, int):
-            raise ValueError(f"`elements` must be a whole number, but is {self.elements!r}.")
+            raise InputError(f"`elements` must be a whole number, but is {self.elements!r}.")
         if self.elements < 2:
-            raise ValueError(f"`elements` must be at least 2, but is {self.elements}.")
+            raise InputError(f"`elements` must be at least 2, but is {self.elements}.")
         _check(self, POSITIVE, "length", "width", "thickness", "young", "density")
         _check(self, NOT_NEGATIVE, "rise")
         _check(self, _POISSON, "poisson")

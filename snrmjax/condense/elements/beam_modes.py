@@ -17,6 +17,7 @@ from snrmjax.condense.elements.strain_energy import (
 from snrmjax.condense.load_cases import ReductionBasis
 from snrmjax.model.modes import have_values
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.rules import InputError
 
 _MIDSPAN_NODE = 0.05  # of the largest displacement, below which midspan counts as a node
 _MECHANISM = 1e-10  # of the largest squared frequency a beam of so many elements could have
@@ -40,15 +41,15 @@ def beam_modes(beam: Beam, modes: Sequence[int]) -> ReductionBasis:
     """
     numbers = tuple(modes)
     if not numbers or len(set(numbers)) < len(numbers):
-        raise ValueError(f"`modes` must be different numbers, at least one, but are {numbers}.")
+        raise InputError(f"`modes` must be different numbers, at least one, but are {numbers}.")
     if min(numbers) < 1 or max(numbers) > beam.elements:
-        raise ValueError(
+        raise InputError(
             f"`modes` must be numbers from 1 to {beam.elements}, which {beam.elements} elements "
             f"can show, but are {numbers}."
         )
     basis = _linear_modes(beam, numbers)
     if have_values(basis) and not np.all(np.isfinite(basis.frequency)):
-        raise ValueError("the supports leave a mechanism: the beam can move without deforming.")
+        raise InputError("the supports leave a mechanism: the beam can move without deforming.")
     return basis
 
 
@@ -130,4 +131,4 @@ def participation(
 
 def _check_fraction(fraction: float) -> None:
     if not 0 <= fraction <= 1:
-        raise ValueError(f"a position must be a fraction of the length, but is {fraction:g}.")
+        raise InputError(f"a position must be a fraction of the length, but is {fraction:g}.")

@@ -29,6 +29,7 @@ from snrmjax.numerics.blocks import on_one_core, over_cores
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, quantity, setting
+from snrmjax.numerics.rules import InputError
 
 EVERYWHERE = "everywhere"
 """Name of a force on the modal coordinate of interest, distributed as its inertia."""
@@ -316,7 +317,7 @@ def _influence_vectors(
     largest = max(moved.values())
     kept = {name: one for name, one in vectors.items() if moved[name] > _UNMOVED * largest}
     if by_default and len(kept) > _MOST:
-        raise ValueError(
+        raise InputError(
             f"{len(kept)} points and pairs are too many candidates: name up to {_MOST} of them, "
             f"such as {', '.join(list(kept)[:3])}."
         )

@@ -28,6 +28,7 @@ from snrmjax.model.modes import residual_velocity
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _FEWEST = 6  # least number of states with a phase
 
@@ -181,7 +182,7 @@ def with_first_gain(
     part = np.real(needed * np.exp(-1j * phase)) / np.maximum(np.cos(phase), 0.5)
     gains = np.abs(needed if unknown.any() else part)
     if not np.any(np.isfinite(gains)):
-        raise ValueError("the model has no motion of the measured amplitude for any state.")
+        raise InputError("the model has no motion of the measured amplitude for any state.")
     gain, caveat, from_curves = float(np.median(gains[np.isfinite(gains)])), None, False
     # Twice: the prior of the first curves is centred on the given model's forces.
     for _ in range(0 if unknown.any() else 2):

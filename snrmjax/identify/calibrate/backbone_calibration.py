@@ -17,6 +17,7 @@ from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
 from snrmjax.numerics.result import Variable, quantity
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.solutions.mode_at_velocities import normal_mode_at_velocities
 
@@ -115,17 +116,17 @@ def calibrate_to_backbone(
     begin = np.array([float(start[name]) for name in names])
     for name, value in zip(names, begin, strict=True):
         if not 0 < value < np.inf:
-            raise ValueError(f"`start` of {name} must be positive, but is {value:g}.")
+            raise InputError(f"`start` of {name} must be positive, but is {value:g}.")
     priors = dict(prior_std or {})
     for name, std in priors.items():
         if name not in names:
-            raise ValueError(f"`prior_std` names {name!r}, which `start` does not have.")
+            raise InputError(f"`prior_std` names {name!r}, which `start` does not have.")
         if not 0 < std < np.inf:
-            raise ValueError(f"`prior_std` of {name} must be positive, but is {std:g}.")
+            raise InputError(f"`prior_std` of {name} must be positive, but is {std:g}.")
     points = _checked(measured)
     n, freedom = len(points.velocity), len(points.velocity) + len(priors) - len(names)
     if not names or freedom < (1 if points.frequency_std is None else 0):
-        raise ValueError(f"{len(names)} parameters need more than the {n} points of a backbone.")
+        raise InputError(f"{len(names)} parameters need more than the {n} points of a backbone.")
     prior = np.array([priors.get(name, np.inf) for name in names])
     settings = names, harmonic_order, steps
 
@@ -197,12 +198,12 @@ def _checked(measured: MeasuredBackbone | BackbonePoints) -> MeasuredBackbone:
         if values is None:
             continue
         if len(values) != n:
-            raise ValueError(f"`{name}` has {len(values)} values for {n} velocities.")
+            raise InputError(f"`{name}` has {len(values)} values for {n} velocities.")
         least = 0.0 if name == "velocity_std" else np.finfo(float).tiny
         good: Bool[np.ndarray, " point"] = np.isfinite(values) & (values >= least)
         if not np.all(good):
             k = int(np.argmin(good))
-            raise ValueError(f"`{name}` must be positive, but point {k} has {values[k]:g}.")
+            raise InputError(f"`{name}` must be positive, but point {k} has {values[k]:g}.")
     return points
 
 

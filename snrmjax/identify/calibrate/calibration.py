@@ -37,6 +37,7 @@ from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
+from snrmjax.numerics.rules import InputError
 
 
 @on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
@@ -83,7 +84,7 @@ def calibrate_model(
     level_std = {"gain": level_gain_std, "phase": level_phase_std}
     for name, value in level_std.items():
         if not 0 <= value < np.inf:
-            raise ValueError(f"`level_{name}_std` must be zero or positive, but is {value}.")
+            raise InputError(f"`level_{name}_std` must be zero or positive, but is {value}.")
     check_phases(data, "a calibration")
     chosen = calibration_states(model, data, harmonic_order)
     prescribed: tuple[tuple[int, ...], ...] = ()
@@ -100,7 +101,7 @@ def calibrate_model(
     weight = np.divide(1.0, prior_std, out=np.zeros(len(names)), where=prior_std > 0)
     n_rows = int(chosen.states.known.sum()) + int(np.sum(weight > 0))
     if n_rows <= len(names):
-        raise ValueError(
+        raise InputError(
             f"{len(names)} parameters need more than {len(names)} data, but {len(chosen.rows)} "
             f"usable states give {n_rows}."
         )
@@ -114,7 +115,7 @@ def calibrate_model(
 
 def _check_prescribed(model: Structure, modes: tuple[int, ...]) -> None:
     if len(set(modes)) < len(modes) or not set(modes) <= set(range(model.n_modes)):
-        raise ValueError(
+        raise InputError(
             f"`held_modes` must be different modes from 0 to {model.n_modes - 1}, but is {modes}."
         )
 

@@ -13,6 +13,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 OneKind = TypeVar("OneKind", Array, np.ndarray)
 
@@ -64,7 +65,7 @@ def calibration_states(
     state is left.
     """
     if data.sensors != model.modes.sensors:
-        raise ValueError(
+        raise InputError(
             f"`data` has the sensors {list(data.sensors)}, but `model` has "
             f"{list(model.modes.sensors)}."
         )
@@ -80,7 +81,7 @@ def calibration_states(
     force, frequency = host.force, host.frequency
     rows = np.flatnonzero(measured[:, 0] & np.isfinite(force) & (force > 0) & (frequency > 0))
     if not rows.size:
-        raise ValueError(
+        raise InputError(
             f"no state has a force above zero and a velocity of {data.sensors[r]!r}, the sensor "
             "that sees the mode of interest best."
         )

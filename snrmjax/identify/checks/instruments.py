@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _NEAR_RESONANCE = np.radians(20)  # phase from resonance, within which inertia hardly counts
 
@@ -63,12 +64,12 @@ def require_passive(
     """
     sign_unknown = tuple(name for name in free if name != "force_offset")
     if not mass > 0:
-        raise ValueError(str(Fact("fit_not_passive", what="modal mass", free=sign_unknown)))
+        raise InputError(str(Fact("fit_not_passive", what="modal mass", free=sign_unknown)))
     not_passive = damping is not None and not bool(
         (np.all if sign_unknown else np.any)(damping > 0)
     )
     if not_passive:
-        raise ValueError(str(Fact("fit_not_passive", what="damping", free=sign_unknown)))
+        raise InputError(str(Fact("fit_not_passive", what="damping", free=sign_unknown)))
 
 
 def notes_on_instruments(fit: Any) -> list[Fact]:
@@ -89,6 +90,6 @@ def notes_on_instruments(fit: Any) -> list[Fact]:
         else:
             note = Fact("instrument_undetermined", name=name, std=std_of_unknown, how=how)
         if how is Determination.NOT_AT_ALL:
-            raise ValueError(str(note))
+            raise InputError(str(note))
         notes += [] if note is None else [note]
     return notes

@@ -19,6 +19,7 @@ from snrmjax.identify.curves.family_base import (
     Terms,
 )
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline, spline_terms
+from snrmjax.numerics.rules import InputError
 
 
 class SumOfPowers(AbstractFamily):
@@ -196,12 +197,12 @@ def parse_family(text: str) -> Choice:
     head, _, argument = text.partition("@")
     kind, _, size = head.partition(":")
     if kind not in FAMILIES and kind != "auto":
-        raise ValueError(f"{kind!r} is no family; there are {', '.join(FAMILIES)} and auto.")
+        raise InputError(f"{kind!r} is no family; there are {', '.join(FAMILIES)} and auto.")
     if size and not size.isdigit():
-        raise ValueError(f"the size of a family must be a whole number, but is {size!r}.")
+        raise InputError(f"the size of a family must be a whole number, but is {size!r}.")
     known = {"": None} | {name: name for name in ARGUMENTS}
     if argument not in known:
-        raise ValueError(f'the amplitude must be "displacement" or "velocity", not {argument!r}.')
+        raise InputError(f'the amplitude must be "displacement" or "velocity", not {argument!r}.')
     return Choice(kind, int(size) if size else None, known[argument])
 
 

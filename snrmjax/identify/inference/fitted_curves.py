@@ -11,6 +11,7 @@ from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, banded_values
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.rules import InputError
 
 _SCAN = 256  # displacements at which the backbone is sampled to bracket a velocity
 _ITERATIONS = 12
@@ -35,7 +36,7 @@ def fitted_values(
     Not differentiable: differentiate `snrmjax.identify.refit`.
     """
     if (velocity is None) == (displacement is None):
-        raise ValueError("give either `velocity` or `displacement`.")
+        raise InputError("give either `velocity` or `displacement`.")
     if velocity is not None:
         curves = values_at_velocity(fit, np.asarray(velocity, np.float64))
     else:
@@ -142,12 +143,12 @@ def values_at_velocity(fit: JointFit, velocity: Float[np.ndarray, " point"]) -> 
     """
     backbone = _backbone_to(fit, float(np.max(velocity)))
     if backbone.reverses_at is not None:
-        raise ValueError(
+        raise InputError(
             f"the backbone turns back at {backbone.reverses_at:.4g} m/s, so that a velocity has "
             "several displacements: give displacements instead."
         )
     if np.max(velocity) > backbone.speed[-1]:
-        raise ValueError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
+        raise InputError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
     near = np.interp(velocity, backbone.speed, backbone.displacement)
     return _on_backbone(fit, velocity, near)
 

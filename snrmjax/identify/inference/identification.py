@@ -29,6 +29,7 @@ from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 _FEWEST = 2  # points for a curve
@@ -136,7 +137,7 @@ def identify_backbone(
     points = identify_points(data, modes_of(modes), amplitude=amplitude, measure=measure)
     usable = np.asarray(points.usable) & np.isfinite(np.asarray(points.amplitude))
     if usable.sum() < _FEWEST:
-        raise ValueError(
+        raise InputError(
             f"a backbone needs at least {_FEWEST} solved points, but only {int(usable.sum())} of "
             f"{usable.size} are: {reasons_in_words(points.status)}."
         )

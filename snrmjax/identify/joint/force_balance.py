@@ -24,6 +24,7 @@ from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD, LinearModes, residual_velocity
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import as_numpy, compiled
+from snrmjax.numerics.rules import InputError
 
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """Random errors of every state, relative or in rad; that of the stiffness is never stated."""
@@ -131,7 +132,7 @@ def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " erro
     j = model.modes.mode_of_interest
     natural, ratio = model.modes.natural_frequency.item(j), model.modes.damping_ratio.item(j)
     if damping > 0 and ratio <= 0:
-        raise ValueError(
+        raise InputError(
             "`level_damping_std` is stated, but the linear damping ratio that it is relative to "
             "is 0: state a damping ratio."
         )

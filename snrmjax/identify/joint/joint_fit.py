@@ -53,6 +53,7 @@ from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 _MOVED = 2.0  # standard deviations from which a level error is reported
@@ -274,23 +275,23 @@ def fit_jointly(
     modes = modes_of(modes)
     unknown = [name for name in free if name not in FREE]
     if unknown:
-        raise ValueError(f"`free` knows {', '.join(FREE)}, not {unknown[0]!r}.")
+        raise InputError(f"`free` knows {', '.join(FREE)}, not {unknown[0]!r}.")
     if data.sensors != modes.sensors:
-        raise ValueError(
+        raise InputError(
             f"`data` has the sensors {list(data.sensors)}, but `modes` has {list(modes.sensors)}."
         )
     choices = parse_family(backbone), parse_family(damping)
     measured, stated, numbers = balance_data(data, modes)
     n = len(measured.level)
     if n < 3:
-        raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
+        raise InputError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
     knots = {
         choice.size for choice in choices if choice.kind == SmoothingSpline.kind and choice.size
     }
     if len(knots) > 1:
-        raise ValueError(
+        raise InputError(
             f"both smooth curves share their knots: give both the same number, not {min(knots)} "
             f"and {max(knots)}."
         )

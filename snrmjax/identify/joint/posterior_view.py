@@ -29,6 +29,7 @@ from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE, WITH_FREQUENC
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
+from snrmjax.numerics.rules import InputError
 
 _FREE = 3.0  # 1σ of unknown instrument errors about their initial guess
 LEAST_LEFT = 0.25
@@ -304,7 +305,7 @@ def _nearest(posterior: TestPosterior, choice: Choice, which: int) -> AbstractFa
             at = x if argument == "displacement" else np.abs(posterior.states.velocity)
             for member in family.starts(order, Scattered(argument, at, values, 1 / std)):
                 if member.parameters.shape[0] >= n:
-                    raise ValueError(
+                    raise InputError(
                         f"{choice.kind}:{order} has {member.parameters.shape[0]} parameters, but "
                         f"there are only {n} states: choose a smaller family."
                     )

@@ -38,6 +38,7 @@ from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import quantity
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 _HIGHEST = 30  # half the model order
@@ -135,7 +136,7 @@ def fit_free_decay(
             values = values[:, _FILTER_ENDS:-_FILTER_ENDS]
     values = values[:, :_MOST_SAMPLES]
     if values.shape[1] < _FEWEST_SAMPLES:
-        raise ValueError(
+        raise InputError(
             f"a decay needs {_FEWEST_SAMPLES} samples at least, but has {values.shape[1]}."
         )
     highest = min(highest_order or _HIGHEST, values.shape[1] // 8)
@@ -152,7 +153,7 @@ def _channels(recordings: Sequence[TimeRecording], names: Sequence[str] | None) 
             recording.channel_names != first.channel_names
             or recording.sampling_rate != first.sampling_rate
         ):
-            raise ValueError(
+            raise InputError(
                 "decays must share their channels and sampling rate, but have "
                 f"{', '.join(recording.channel_names)} at {recording.sampling_rate:.6g} Hz and "
                 f"{', '.join(first.channel_names)} at {first.sampling_rate:.6g} Hz."
@@ -160,7 +161,7 @@ def _channels(recordings: Sequence[TimeRecording], names: Sequence[str] | None) 
     if names is None:
         motions = [channel for channel in first.channels if channel.quantity in POWERS]
         if not motions:
-            raise ValueError(
+            raise InputError(
                 "a decay needs a channel that is a displacement, velocity or acceleration, but "
                 f"there are {', '.join(map(str, first.channels))}."
             )
@@ -168,7 +169,7 @@ def _channels(recordings: Sequence[TimeRecording], names: Sequence[str] | None) 
     by_name = {channel.name: channel for channel in first.channels}
     for name in names:
         if name not in by_name:
-            raise ValueError(f"there is no channel {name!r}; there are {', '.join(by_name)}.")
+            raise InputError(f"there is no channel {name!r}; there are {', '.join(by_name)}.")
     return [by_name[name] for name in names]
 
 
@@ -182,16 +183,16 @@ def _part(
     values = recording.values([channel.name for channel in channels])
     time = recording.time()
     if not np.isfinite(values).all():
-        raise ValueError(f"decay {number + 1} has samples that are not finite.")
+        raise InputError(f"decay {number + 1} has samples that are not finite.")
     if not np.any(values):
-        raise ValueError(f"decay {number + 1} is zero throughout.")
+        raise InputError(f"decay {number + 1} is zero throughout.")
     if start is None:
         scaled = np.abs(values - np.median(values, axis=1, keepdims=True))
         start = float(time[np.argmax(scaled.max(axis=0))])
     last = np.inf if end is None else end
     keep = (time >= start) & (time <= last)
     if keep.sum() < _FEWEST_SAMPLES:
-        raise ValueError(
+        raise InputError(
             f"a decay needs {_FEWEST_SAMPLES} samples at least, but {int(keep.sum())} lie from "
             f"{start:.6g} s on in decay {number + 1}."
         )
@@ -253,7 +254,7 @@ def _start(
         wanted = np.sort(np.asarray(poles, dtype=float))
         damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < LIGHTLY_DAMPED)]
         if not wanted.size or np.any(wanted <= 0) or np.any(wanted >= top) or not damped.size:
-            raise ValueError(
+            raise InputError(
                 f"poles must be from 0 to {top / HERTZ:.6g} Hz, where the decay has some, but "
                 f"are {', '.join(f'{one / HERTZ:.6g}' for one in wanted) or 'none'}."
             )
@@ -261,7 +262,7 @@ def _start(
     stable = clusters(orders, (0.0, top))
     stable = stable[stable.real < 0]
     if not stable.size:
-        raise ValueError(
+        raise InputError(
             "no pole is stable over the model orders of the decay: choose the part that decays, "
             "a lower highest frequency, or the natural frequencies by hand."
         )
@@ -307,7 +308,7 @@ def _decay_modes(
         return _amplitude_dependent(parts, values, rate)
     fit = few if poles is not None else with_modes(values, time, start, few)
     if fit is None:
-        raise ValueError(_NOTHING)
+        raise InputError(_NOTHING)
     if poles is not None:
         return AcceptedModes(fit, np.ones(fit.form.n_modes, dtype=bool))
     if parts and nonlinear_before_last_part(parts, fit, noise):
@@ -318,7 +319,7 @@ def _decay_modes(
         kept = significant(fit)
     kept &= fit.damping_ratio > 0
     if not kept.any():
-        raise ValueError(_NOTHING)
+        raise InputError(_NOTHING)
     return AcceptedModes(fit, kept)
 
 

@@ -26,6 +26,7 @@ from snrmjax.identify.modal.weighted_fit import (
 )
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 ResidualTerms = Literal["auto", "both", "lower", "upper", "none"]
@@ -40,7 +41,7 @@ _SIGNIFICANT_CURVATURE = 12.0  # least reduction of χ² per sensor by a further
 _EVEN = 1e-3  # of the line spacing
 
 
-class GrowingModes(ValueError):
+class GrowingModes(InputError):
     """All modes of the responses have negative damping, as for the convention e^(-iΩt)."""
 
     def __init__(self, modes: str) -> None:
@@ -117,7 +118,7 @@ def basis_settings(
     Raises `ValueError` for unknown options, and for leakage between lines that are not on a grid.
     """
     if terms not in get_args(ResidualTerms):
-        raise ValueError(
+        raise InputError(
             f"`residual_terms` must be one of {', '.join(get_args(ResidualTerms))}, but is "
             f"{terms!r}."
         )
@@ -126,12 +127,12 @@ def basis_settings(
     time = None
     if window is not None:
         if window != "hann":
-            raise ValueError(f"`window` must be 'hann' or None, but is {window!r}.")
+            raise InputError(f"`window` must be 'hann' or None, but is {window!r}.")
         spacing = np.diff(data.omega)
         step = float(np.median(spacing))
         # Lines may be missing, but must lie on a grid.
         if np.any(np.abs(spacing / step - np.round(spacing / step)) > _EVEN):
-            raise ValueError("leakage is modelled for evenly spaced lines, but these are not.")
+            raise InputError("leakage is modelled for evenly spaced lines, but these are not.")
         time = 2 * np.pi / step
     return BasisSettings(
         lower=terms in ("both", "lower"),
@@ -145,7 +146,7 @@ def _orders(data: ResponseData, highest: int | None) -> PoleOrders:
     lines = len(data.omega)
     most = max(2, min(_HIGHEST, lines // _LINES_PER_ORDER))
     if highest is not None and not 1 <= highest <= lines // 2:
-        raise ValueError(
+        raise InputError(
             f"the highest order must be from 1 to half the number of lines, {lines // 2}, but is "
             f"{highest}."
         )
@@ -167,7 +168,7 @@ def _start(
         return _by_hand(orders, np.asarray(poles, dtype=float), band)
     if order is not None:
         if not 1 <= order <= orders.highest:
-            raise ValueError(
+            raise InputError(
                 f"`order` must be from 1 to {orders.highest}, the highest that was computed, but "
                 f"is {order}."
             )
@@ -177,7 +178,7 @@ def _start(
             inside & (of_order.real < 0) & (-of_order.real < LIGHTLY_DAMPED * np.abs(of_order))
         ]
         if not of_order.size:
-            raise ValueError(f"model order {order} has no lightly damped pole in the band.")
+            raise InputError(f"model order {order} has no lightly damped pole in the band.")
         return of_order[np.argsort(np.abs(of_order))]
     stable = clusters(orders, band)
     damped, growing = stable[stable.real < 0], stable[stable.real > 0]
@@ -189,7 +190,7 @@ def _start(
             f"{100 * -p.real / abs(p):.3g} % at {abs(p) / HERTZ:.6g} Hz" for p in growing[:3]
         )
         raise GrowingModes(f"all modes {where} have negative damping ({listed})")
-    raise ValueError(
+    raise InputError(
         f"no pole is stable over the model orders {where}: widen the band, raise the highest "
         "order, or give the natural frequencies by hand."
     )
@@ -199,11 +200,11 @@ def _by_hand(
     orders: PoleOrders, given: np.ndarray, band: tuple[float, float]
 ) -> Complex[np.ndarray, " mode"]:
     if not given.size or not np.isfinite(given).all():
-        raise ValueError("`poles` must be natural frequencies, at least one.")
+        raise InputError("`poles` must be natural frequencies, at least one.")
     chosen = []
     for omega in np.sort(given):
         if not band[0] <= omega <= band[1]:
-            raise ValueError(
+            raise InputError(
                 f"a pole must lie in the band, {band[0] / HERTZ:.6g} to {band[1] / HERTZ:.6g} "
                 f"Hz, but {omega / HERTZ:.6g} Hz was given."
             )
@@ -237,7 +238,7 @@ def _fitted(
             break
         n = (len(unknowns) - settings.phase) // 2
         if n == 1:
-            raise ValueError(
+            raise InputError(
                 "no mode stands out of the errors of the responses: the residues of all are "
                 "within four standard errors of zero."
             )
@@ -288,7 +289,7 @@ def _check_modes(fit: SeparableFit, settings: BasisSettings) -> None:
         )
     if np.any(ratio <= 0) or np.any(ratio >= MOST_DAMPED):
         k = int(np.argmax((ratio <= 0) | (ratio >= MOST_DAMPED)))
-        raise ValueError(
+        raise InputError(
             f"the mode at {natural[k] / HERTZ:.6g} Hz has the damping ratio {ratio[k]:.3g}: the "
             "responses do not show such a mode; give other poles or another band."
         )

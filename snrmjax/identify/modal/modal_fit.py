@@ -13,6 +13,7 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 WIDE = 1.96
@@ -158,7 +159,7 @@ class LinearModalFit(AbstractModalFit):
     def sensor_number(self, name: str) -> int:
         """Index of a sensor. Raises `ValueError` with the available names."""
         if name not in self.sensor_names:
-            raise ValueError(
+            raise InputError(
                 f"there is no sensor {name!r}; there are {', '.join(self.sensor_names)}."
             )
         return self.sensor_names.index(name)

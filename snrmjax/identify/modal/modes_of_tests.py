@@ -24,6 +24,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.moving_base import SensorMotion
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 _CHANGE_STDS = 2.0  # standard errors of a difference between levels
@@ -60,7 +61,7 @@ def find_modes(
     if source.base is not None and source.base.motion == "absolute":
         base = "relative"  # the base motion is subtracted already
     elif source.base is not None and base is None:
-        raise ValueError(
+        raise InputError(
             "these states are of a moving base: state what the sensors record, `--base absolute` "
             "or `--base relative`."
         )
@@ -73,7 +74,7 @@ def find_modes(
     asked = {**settings, "std": lowest.std}
     try:
         modes = _of_responses(lowest.responses, base, asked)
-    except ValueError:
+    except InputError:
         given = settings.get("poles") is not None or settings.get("order") is not None
         start = None if given else pole_of_states(rows)
         if start is None:
@@ -96,7 +97,7 @@ def find_modes(
     by_hand = {"poles": tuple(modes.natural_frequency), "order": None, "std": other.std}
     try:
         second = _of_responses(other.responses, base, {**settings, **by_hand})
-    except ValueError as error:
+    except InputError as error:
         pair = {"level": chosen, "other": above[0]}
         return modes, (Fact("levels_not_compared", **pair, reason=str(error)),)
     return amplitude_dependence(modes, second, (lowest.velocity, other.velocity))
@@ -135,9 +136,9 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
     rows = np.asarray(data.level) == level
     if not rows.any():
         listed = ", ".join(map(str, np.unique(np.asarray(data.level)).tolist()))
-        raise ValueError(f"there is no level {level}; there are {listed}.")
+        raise InputError(f"there is no level {level}; there are {listed}.")
     if np.any(np.asarray(data.phase_unknown)[rows]):
-        raise ValueError("modes need phases, but only amplitudes of velocities were measured.")
+        raise InputError("modes need phases, but only amplitudes of velocities were measured.")
     reference, load, velocity, std, known = over_reference(data, rows)
     measured, mobility, parts = (
         np.isfinite(velocity),
@@ -226,17 +227,17 @@ def relative_to_base(
     motion and for unknown sensors.
     """
     if motion not in get_args(SensorMotion):
-        raise ValueError(f"the motion must be 'absolute' or 'relative', but is {motion!r}.")
+        raise InputError(f"the motion must be 'absolute' or 'relative', but is {motion!r}.")
     if len(responses.references) != 1 or responses.references[0].quantity not in POWERS:
         listed = ", ".join(str(channel) for channel in responses.references)
-        raise ValueError(
+        raise InputError(
             "motion over a base needs one reference that is a displacement, velocity or "
             f"acceleration, but has {listed}."
         )
     names = [channel.name for channel in responses.responses]
     for name in along or {}:
         if name not in names:
-            raise ValueError(f"there is no sensor {name!r}; there are {', '.join(names)}.")
+            raise InputError(f"there is no sensor {name!r}; there are {', '.join(names)}.")
     reference = responses.references[0]
     keep = responses.frequency > 0
     s = 1j * responses.frequency[keep]
@@ -245,7 +246,7 @@ def relative_to_base(
         responses.responses, responses.values[:, 0], responses.coherence[:, 0], strict=True
     ):
         if channel.quantity not in POWERS:
-            raise ValueError(f"{channel.name} must be a motion, but is {channel.quantity}.")
+            raise InputError(f"{channel.name} must be a motion, but is {channel.quantity}.")
         over = row[keep] * s ** (POWERS[reference.quantity] - POWERS[channel.quantity])
         spread.append(coherence_std(np.abs(over), known[keep], responses.averages))
         of_base = (along or {}).get(channel.name, 1.0) if motion == "absolute" else 0.0

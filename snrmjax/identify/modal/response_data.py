@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 ErrorSource = Literal["stated", "coherence", "residuals"]
@@ -79,26 +80,26 @@ def response_data(
     low = 0.0 if from_frequency is None else from_frequency
     high = np.inf if to_frequency is None else to_frequency
     if not low < high:
-        raise ValueError(
+        raise InputError(
             f"the band must rise, but is from {low / HERTZ:.6g} to {high / HERTZ:.6g} Hz."
         )
     omega = responses.frequency
     keep = (omega > 0) & (omega >= low * (1 - 1e-12)) & (omega <= high * (1 + 1e-12))
     keep &= np.isfinite(responses.values[:, column]).any(axis=0)
     if keep.sum() < _FEWEST_LINES:
-        raise ValueError(
+        raise InputError(
             f"modes need {_FEWEST_LINES} lines at least, but {int(keep.sum())} of "
             f"{len(omega)} lie in the band and were measured."
         )
     raw = responses.values[:, column][:, keep]
     for channel, row in zip(responses.responses, raw, strict=True):
         if not np.any(np.nan_to_num(row)):
-            raise ValueError(f"the response {channel.name} is zero or missing throughout the band.")
+            raise InputError(f"the response {channel.name} is zero or missing throughout the band.")
     coherence = responses.coherence[:, column][:, keep]
     bad = np.argwhere((coherence < 0) | (coherence > 1 + 1e-9))
     if bad.size:
         k, line = bad[0]
-        raise ValueError(
+        raise InputError(
             f"a coherence must be from 0 to 1, but that of {responses.responses[k].name} at "
             f"{omega[keep][line] / HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
         )
@@ -130,14 +131,14 @@ def joined_responses(parts: Sequence[FrequencyResponses]) -> FrequencyResponses:
         if part.frequency.shape != first.frequency.shape or np.any(
             np.abs(part.frequency - first.frequency) > _SAME_FREQUENCY * first.frequency[-1]
         ):
-            raise ValueError(
+            raise InputError(
                 f"responses of one test must share their frequencies, but {file} has "
                 f"{len(part.frequency)} lines to {part.frequency[-1] / HERTZ:.6g} Hz and "
                 f"{first.name or 'the first'} {len(first.frequency)} to "
                 f"{first.frequency[-1] / HERTZ:.6g} Hz."
             )
         if [r.name for r in part.references] != [r.name for r in first.references]:
-            raise ValueError(
+            raise InputError(
                 f"responses of one test must share their references, but {file} has "
                 f"{', '.join(r.name for r in part.references)} and {first.name or 'the first'} "
                 f"{', '.join(r.name for r in first.references)}."
@@ -146,7 +147,7 @@ def joined_responses(parts: Sequence[FrequencyResponses]) -> FrequencyResponses:
     names = [c.name for c in channels]
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"the response {name} comes {names.count(name)} times in the files.")
+            raise InputError(f"the response {name} comes {names.count(name)} times in the files.")
     return dataclasses.replace(
         first,
         values=np.concatenate([part.values for part in parts]),
@@ -161,12 +162,12 @@ def _reference(responses: FrequencyResponses, name: str | None) -> int:
     if name is None and len(names) == 1:
         return 0
     if name is None:
-        raise ValueError(
+        raise InputError(
             f"modes are fitted over one reference, but there are {len(names)} "
             f"({', '.join(names)}): name one as the reference."
         )
     if name not in names:
-        raise ValueError(f"there is no reference {name!r}; there are {', '.join(names)}.")
+        raise InputError(f"there is no reference {name!r}; there are {', '.join(names)}.")
     return names.index(name)
 
 
@@ -174,7 +175,7 @@ def _check_quantities(responses: FrequencyResponses) -> None:
     for channel in responses.responses:
         if channel.quantity not in POWERS:
             named = channel.quantity if channel.quantity != "unknown" else "of no stated quantity"
-            raise ValueError(
+            raise InputError(
                 "a response must be a displacement, velocity or acceleration, but "
                 f"{channel.name} is {named}."
             )
@@ -192,13 +193,13 @@ def _errors(
     if std is not None:
         given = np.asarray(std, dtype=float)
         if given.shape != (len(responses.responses), len(responses.frequency)):
-            raise ValueError(
+            raise InputError(
                 f"`std` must have one value a response and line, "
                 f"{(len(responses.responses), len(responses.frequency))}, but has {given.shape}."
             )
         inside = given[:, keep]
         if not np.all(inside[np.isfinite(raw)] > 0):
-            raise ValueError("`std` must be positive wherever a response was measured.")
+            raise InputError("`std` must be positive wherever a response was measured.")
         return inside, "stated", []
     stated = np.isfinite(coherence) & np.isfinite(raw)
     if not stated.any():
@@ -208,7 +209,7 @@ def _errors(
     if np.median(coherence[stated]) > 1 - _LEAST_MISSING_COHERENCE:
         return unknown, "residuals", [Fact("coherence_is_one")]
     if np.median(coherence[stated]) <= 0:
-        raise ValueError("the coherence is zero at most lines: no response follows the reference.")
+        raise InputError("the coherence is zero at most lines: no response follows the reference.")
     return coherence_std(np.abs(raw), coherence, responses.averages), "coherence", []
 
 

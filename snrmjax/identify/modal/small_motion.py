@@ -23,6 +23,7 @@ from snrmjax.identify.modal.decay_fit import (
     with_modes,
     without_mode,
 )
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 Candidates = Callable[[Float[np.ndarray, "channel sample"]], list[complex]]
@@ -151,7 +152,7 @@ def parts_of_decay(
     if _halving_accelerates(begins):
         last = begins[-_FALLS], omega  # the motion may have stopped afterwards
         why = "its damping grows as the motion falls, as dry friction has it"
-        raise ValueError(_refusal([], last, values, rate, why))
+        raise InputError(_refusal([], last, values, rate, why))
     parts: list[PartFit] = []
     for number, first in enumerate(reversed(begins), 1):
         part = values[:, first:]
@@ -175,9 +176,7 @@ def parts_of_decay(
 def _halving_accelerates(begins: list[int]) -> bool:
     """Whether the last halvings take less and less time, unlike viscously damped motion."""
     times = np.diff(begins)
-    if len(times) < _FALLS:
-        return False
-    return bool(
+    return len(times) >= _FALLS and bool(
         np.all(times[1 - _FALLS :] < _SHORTER * times[-_FALLS:-1])
         and times.max() > _MUCH_LONGER * times[-1]
     )
@@ -357,7 +356,7 @@ def small_motion(
             part = part._replace(spread=np.hypot(part.spread, beyond))
         chosen, before = part, chosen
     if chosen is None:
-        raise ValueError(_refusal(parts, last, values, rate, "no part of it is explained"))
+        raise InputError(_refusal(parts, last, values, rate, "no part of it is explained"))
     here = values[:, chosen.first :]
     time = np.arange(here.shape[1]) / rate
     if dependent and not chosen.fitted.form.powers:
@@ -368,12 +367,12 @@ def small_motion(
     with_friction = [_with_powers(fitted, powers, here, time) for powers in _FRICTION]
     if max(one.information for one in with_friction) > fitted.information + _BETTER:
         why = "its damping grows as the motion falls, as dry friction has it"
-        raise ValueError(_refusal(parts, last, values, rate, why))
+        raise InputError(_refusal(parts, last, values, rate, why))
     value, std = chosen.limit()
     change = np.abs(_at_the_end(fitted, time) / value - 1)
     if value[1] <= 0 or np.any(change > _LARGEST_CHANGE) or np.any(std / value > _NOT_KNOWN):
         why = "they are still changing where it ends or disappears in noise"
-        raise ValueError(_refusal(parts, last, values, rate, why))
+        raise InputError(_refusal(parts, last, values, rate, why))
     kept = significant(fitted) & (fitted.damping_ratio > 0)
     if before is not None:
         later = before.fitted.natural_frequency

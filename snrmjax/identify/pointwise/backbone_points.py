@@ -25,6 +25,7 @@ from snrmjax.measure.states import SteadyStates, check_force, check_phases, rela
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import InputError
 
 
 class BackbonePoints(AbstractResult):
@@ -120,19 +121,19 @@ def identify_points(
     Reference: Kwarta & Allen, section 2.2; the displacement argument is this package's own.
     """
     if data.sensors != modes.sensors:
-        raise ValueError(
+        raise InputError(
             f"`data` has the sensors {list(data.sensors)}, but `modes` has {list(modes.sensors)}."
         )
     if amplitude not in ("displacement", "velocity"):
-        raise ValueError(f'`amplitude` must be "displacement" or "velocity", not {amplitude!r}.')
+        raise InputError(f'`amplitude` must be "displacement" or "velocity", not {amplitude!r}.')
     if measure not in ("fundamental", "peak"):
-        raise ValueError(f'`measure` must be "fundamental" or "peak", not {measure!r}.')
+        raise InputError(f'`measure` must be "fundamental" or "peak", not {measure!r}.')
     if data.n_states == 0:
-        raise ValueError("`data` has no steady states.")
+        raise InputError("`data` has no steady states.")
     check_phases(data, "an identification")
     check_force(data, "an identification point by point")
     if measure == "peak" and not set(data.harmonic_order) - {1}:
-        raise ValueError(
+        raise InputError(
             '`measure="peak"` needs harmonics, but the steady states have the fundamental only.'
         )
     return _identify(data, modes, reference_sensor(modes), amplitude, measure)

@@ -18,6 +18,7 @@ from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity
+from snrmjax.numerics.rules import InputError
 
 
 class Resonance(AbstractResult):
@@ -188,7 +189,7 @@ def predict_response(
 
 def _require_force(force: float) -> None:
     if not force > 0 or not np.isfinite(force):
-        raise ValueError(f"`force` must be positive, but is {force!r} N.")
+        raise InputError(f"`force` must be positive, but is {force!r} N.")
 
 
 def _scan(backbone: Backbone, ratio: float) -> Float[np.ndarray, " point"]:
@@ -197,7 +198,7 @@ def _scan(backbone: Backbone, ratio: float) -> Float[np.ndarray, " point"]:
     Not beyond zero extrapolated damping: a passive structure has no negative damping.
     """
     if not ratio > 0 or not np.isfinite(ratio):
-        raise ValueError(f"`largest_amplitude_ratio` must be positive, but is {ratio!r}.")
+        raise InputError(f"`largest_amplitude_ratio` must be positive, but is {ratio!r}.")
     n = int(np.ceil(_SCAN * max(ratio / LARGEST_AMPLITUDE_RATIO, 1.0)))
     scan = ratio * float(backbone.largest) * np.linspace(0.0, 1.0, n + 1)
     none_left = (scan > float(backbone.largest)) & (_on_backbone(backbone, scan).damping <= 0)

@@ -8,6 +8,8 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from snrmjax.numerics.rules import InputError
+
 
 class CramersRule(lx.AbstractLinearSolver[Any]):
     """Solves a 2×2 linear system by Cramer's rule, for cheap Newton steps.
@@ -21,7 +23,7 @@ class CramersRule(lx.AbstractLinearSolver[Any]):
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Array:
         """See `lineax.AbstractLinearSolver.init`."""
         if operator.in_size() != 2 or operator.out_size() != 2:
-            raise ValueError("`CramersRule` solves systems of two equations for two unknowns only.")
+            raise InputError("`CramersRule` solves systems of two equations for two unknowns only.")
         return operator.as_matrix()
 
     def compute(

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from snrmjax.identify.modal.modal_fit import WIDE, LinearModalFit
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 _SHIFT_STDS = 3.0  # smallest significant frequency shift, in standard errors
@@ -37,13 +38,13 @@ def squared_shapes(
     that the mass does not lower by at least three standard errors.
     """
     if not (np.isfinite(mass) and mass > 0 and mass_std >= 0):
-        raise ValueError(f"an added mass must be positive (kg), but is {mass:g} ± {mass_std:g}.")
+        raise InputError(f"an added mass must be positive (kg), but is {mass:g} ± {mass_std:g}.")
     before, own_std = without.natural_frequency, without.natural_frequency_std
     after, after_std = _partners(without, with_mass)
     shift, spread = before - after, np.hypot(own_std, after_std)
     for k in range(len(before)):
         if shift[k] < _SHIFT_STDS * spread[k]:
-            raise ValueError(
+            raise InputError(
                 f"the added mass of {mass:.4g} kg must lower the frequency of mode {k + 1}, but "
                 f"it goes from {before[k] / HERTZ:.7g} to {after[k] / HERTZ:.7g} Hz, "
                 f"{shift[k] / HERTZ:.2g} ± {WIDE * spread[k] / HERTZ:.2g} Hz (95 %) lower: take "
@@ -52,7 +53,7 @@ def squared_shapes(
     squared = _solved(before, after, mass)
     if np.any(squared <= 0):
         k = int(np.argmin(squared))
-        raise ValueError(
+        raise InputError(
             f"the frequencies with the added mass of {mass:.4g} kg give mode {k + 1} a squared "
             f"shape of {squared[k]:.3g} 1/kg: they are not those of the same structure with that "
             "mass."
@@ -92,7 +93,7 @@ def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.nd
     if len(after) == len(before):
         return after, with_mass.natural_frequency_std
     if len(after) < len(before):
-        raise ValueError(
+        raise InputError(
             f"the test with the added mass must show the {len(before)} modes of the test without "
             f"it, but shows {len(after)}: {_BY_BAND}."
         )
@@ -102,5 +103,5 @@ def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.nd
         for frequency in before
     ]
     if len(set(chosen)) < len(chosen):
-        raise ValueError(f"the modes of both tests cannot be paired: {_BY_BAND}.")
+        raise InputError(f"the modes of both tests cannot be paired: {_BY_BAND}.")
     return after[chosen], with_mass.natural_frequency_std[chosen]

@@ -12,6 +12,7 @@ from snrmjax.identify.scaling.added_mass import squared_shapes
 from snrmjax.identify.scaling.scaled_modes import ScaledModes, rigid_body_mode
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _PER = {"force": "N", "voltage": "V", "acceleration": "m/s²"}
 _RESIDUE_STDS = 3.0  # smallest significant drive-point residue, in standard errors
@@ -44,7 +45,7 @@ class DrivePoint(NamedTuple):
     def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
         """p = √A of the drive point."""
         if fit.reference.quantity not in ("force", "voltage"):
-            raise ValueError(
+            raise InputError(
                 f"a drive point needs a force, but the reference {fit.reference.name} is the "
                 f"{fit.reference.quantity} of a base: give sensor masses, an added mass or a known "
                 "shape."
@@ -57,14 +58,14 @@ class DrivePoint(NamedTuple):
         if np.all(drive_residue[sure] < 0) and sure.any():
             advice = "leave out" if self.turned else "state"
             advice = f"{advice} that the sensor is turned"
-            raise ValueError(
+            raise InputError(
                 f"the residues at the drive point {fit.sensor_names[d]} are negative "
                 f"({drive_residue[sure][0]:.4g} 1/kg at {hertz[sure][0]:.6g} Hz): sensor and force "
                 f"have opposite directions; {advice}, or change a sign."
             )
         keep = sure & (drive_residue > 0)
         if not keep.any():
-            raise ValueError(
+            raise InputError(
                 f"the residues at the drive point {fit.sensor_names[d]} are within three standard "
                 "errors of zero: it is at a node of all modes and gives no scale."
             )
@@ -85,7 +86,7 @@ class DrivePoint(NamedTuple):
             return fit.sensor_number(self.sensor), sign
         drive = _drive_point_of(fit)
         if drive is None:
-            raise ValueError(
+            raise InputError(
                 "the shapes cannot be mass-normalised: no sensor is known to be where the force "
                 f"acts (by points and axes of {', '.join(fit.sensor_names)}); name that sensor, or "
                 "give an added mass, sensor masses or a known shape."
@@ -130,32 +131,32 @@ class SensorMasses(NamedTuple):
     def scaled(self, fit: LinearModalFit, residue: Float[np.ndarray, "sensor mode"]) -> _Scaled:
         """p² = −Σ m A, divided by the mass of a forced fixture."""
         if not self.mass:
-            raise ValueError("a fixture mass needs the masses at the sensors as well.")
+            raise InputError("a fixture mass needs the masses at the sensors as well.")
         mass = np.zeros(len(residue))
         for name, value in self.mass.items():
             if not (np.isfinite(value) and value >= 0):
-                raise ValueError(
+                raise InputError(
                     f"the mass at {name} must not be below zero (kg), but is {value:g}."
                 )
             mass[fit.sensor_number(name)] = value
         if not mass.any():
-            raise ValueError("sensor masses must not all be zero.")
+            raise InputError("sensor masses must not all be zero.")
         base = fit.reference.quantity == "acceleration"
         if not base and self.fixture_mass is None:
-            raise ValueError(
+            raise InputError(
                 "sensor masses scale the response to base motion or, with the mass of a free rigid "
                 f"fixture, that to a force: the reference {fit.reference.name} is "
                 f"{fit.reference.quantity}, and no fixture mass is stated."
             )
         if self.fixture_mass is not None and not self.fixture_mass > 0:
-            raise ValueError(
+            raise InputError(
                 f"a fixture's mass must be positive (kg), but is {self.fixture_mass:g}."
             )
         fixture = 1.0 if base else float(self.fixture_mass or 1.0)
         total = mass @ residue
         if np.any(total >= 0):
             k = int(np.argmax(total >= 0))
-            raise ValueError(
+            raise InputError(
                 f"Σ mass × residue must be negative for a structure moved by its base, but is "
                 f"{total[k]:.3g} at {fit.natural_frequency[k] / 2 / np.pi:.6g} Hz: a sensor is "
                 "turned, or the responses are absolute but were declared relative."
@@ -187,7 +188,7 @@ class KnownShape(NamedTuple):
         """p = A/φ."""
         sensor, n = fit.sensor_number(self.sensor), residue.shape[1]
         if not np.isfinite(self.value) or self.value == 0:
-            raise ValueError(
+            raise InputError(
                 f"the known shape at {self.sensor} must be finite and not zero, but is "
                 f"{self.value:g}."
             )
@@ -251,7 +252,7 @@ def scale_modes(
     """
     if isinstance(fit, DecayModes):
         if by is not None:
-            raise ValueError(
+            raise InputError(
                 "the shapes cannot be mass-normalised: a free decay has no force; take "
                 "frequencies and damping alone (unscaled), or measure frequency responses."
             )
@@ -366,18 +367,18 @@ def _newtons(
     """Newtons per unit of the reference and its relative 1σ."""
     gain = calibration.newtons_per_volt
     if calibration.relative_std < 0 or calibration.newtons_per_volt_std < 0:
-        raise ValueError("the 1σ of a calibration must not be below zero.")
+        raise InputError("the 1σ of a calibration must not be below zero.")
     if fit.reference.quantity == "voltage":
         if gain is None and isinstance(by, DrivePoint | SensorMasses):
-            raise ValueError(
+            raise InputError(
                 "the shapes cannot be mass-normalised: the drive is known in volts only, and "
                 "newtons per volt are not stated (an added mass or a known shape would also do)."
             )
         if gain is not None and not (np.isfinite(gain) and gain > 0):
-            raise ValueError(f"newtons per volt must be positive, but are {gain:g}.")
+            raise InputError(f"newtons per volt must be positive, but are {gain:g}.")
         return (1.0, 0.0) if gain is None else (gain, calibration.newtons_per_volt_std / gain)
     if gain is not None:
-        raise ValueError(
+        raise InputError(
             f"newtons per volt are for a drive voltage, but the reference {fit.reference.name} is "
             f"{fit.reference.quantity}."
         )

@@ -17,6 +17,7 @@ from snrmjax.model.modes import (
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 
@@ -61,7 +62,7 @@ class ScaledModes(AbstractResult):
         Raises `ValueError` for a mode of interest that does not exist.
         """
         if not 0 <= interest < self.n_modes:
-            raise ValueError(
+            raise InputError(
                 f"the mode of interest must be from 1 to {self.n_modes}, the number of modes, but "
                 f"is {interest + 1}."
             )
@@ -160,7 +161,7 @@ def rigid_body_mode(
         )
         return RigidBodyMode(None, 0.0, note)
     if free < 0 or not np.isfinite(free):
-        raise ValueError(f"the mass of a free structure must be positive (kg), but is {free:g}.")
+        raise InputError(f"the mass of a free structure must be positive (kg), but is {free:g}.")
     if free > 0:
         ones = np.full(len(fit.sensors), free**-0.5)
         if not significant:
@@ -177,7 +178,7 @@ def rigid_body_mode(
             if np.isnan(residual)
             else f"is {residual:.3g} ± {WIDE * residual_std:.2g} 1/kg"
         )
-        raise ValueError(
+        raise InputError(
             f"a free structure responds with −1/(m Ω²) at low frequency, but the low residual at "
             f"the drive point {what}: state its mass, or do not declare it free."
         )

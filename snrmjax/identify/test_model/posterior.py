@@ -54,6 +54,7 @@ from snrmjax.identify.test_model.linear_gaussian import laplace_evidence
 from snrmjax.identify.test_model.state_noise import StateNoise, noise_of_states
 from snrmjax.identify.test_model.states import RECORDED, TestStates
 from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.rules import InputError
 
 _ALL = Rounds()
 _NOISE_ROUNDS = 3  # of estimating the noise components, at most
@@ -215,7 +216,7 @@ def fit_test(
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
-        raise ValueError(f"a test needs at least two states, not {len(states.level)}.")
+        raise InputError(f"a test needs at least two states, not {len(states.level)}.")
     if parts_of_noise:
         return _with_parts_of_noise(
             functools.partial(
@@ -260,7 +261,7 @@ def fit_test(
         solver = multistart(balance, rounds, robust=robust, power_likelihood=power_likelihood)
     best = solver.best
     if best is None:
-        raise ValueError(f"`rounds.most` must be at least one, not {rounds.most}.")
+        raise InputError(f"`rounds.most` must be at least one, not {rounds.most}.")
     # 1σ of level errors from few levels is uncertain: widened as Student's t. Their mean, and a
     # part correlated with force, are attributed to the curves, but the bands allow for them as
     # level errors (`exchanged`).

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from snrmjax.io.files import FilePath, file_name, read_text, shown
+from snrmjax.numerics.rules import InputError
 
 _DEEPEST_INCLUDE = 20
 
@@ -66,7 +67,7 @@ def read_blocks(path: FilePath) -> list[Block]:
     while position < len(lines):
         head = lines[position]
         if not head.text.startswith("*"):
-            raise ValueError(
+            raise InputError(
                 f"{head.location}: {shown(head.text)} comes before the first keyword (*NODE, ...)."
             )
         text = head.text
@@ -104,10 +105,10 @@ def _included(line: Line, path: Path, above: tuple[Path, ...]) -> Iterator[Line]
         value.strip().strip('"') for key, value in values.items() if key.strip().upper() == "INPUT"
     ]
     if not given:
-        raise ValueError(f"{line.location}: *INCLUDE needs INPUT=file.")
+        raise InputError(f"{line.location}: *INCLUDE needs INPUT=file.")
     target = path.parent / given[0]
     if target in above or len(above) > _DEEPEST_INCLUDE:
-        raise ValueError(f"{line.location}: {given[0]} includes itself.")
+        raise InputError(f"{line.location}: {given[0]} includes itself.")
     if not target.is_file():
-        raise ValueError(f"{line.location}: the included file {given[0]} does not exist.")
+        raise InputError(f"{line.location}: the included file {given[0]} does not exist.")
     yield from _lines(target, above)

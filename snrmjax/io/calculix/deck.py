@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from snrmjax.io.calculix.blocks import Block, Line, read_blocks
 from snrmjax.io.files import FilePath, file_name, shown
+from snrmjax.numerics.rules import InputError
 
 # CalculiX reads a coordinate from this many characters and silently drops the rest.
 _COORDINATE_WIDTH = 20
@@ -57,7 +58,7 @@ class Deck(eqx.Module):
         """Index of a node in `nodes`. Raises `ValueError` where no element has it."""
         rows = np.flatnonzero(self.nodes == number)
         if not len(rows):
-            raise ValueError(
+            raise InputError(
                 f"{self.name} has no element with node {number} (nodes {self.nodes[0]} to "
                 f"{self.nodes[-1]})."
             )
@@ -133,7 +134,7 @@ def _thickness(blocks: list[Block], coordinates: Float[np.ndarray, "node 3"]) ->
             entries = line.entries[: 2 if beam else 1]
             dimensions += [_number(line, entry, "a dimension") for entry in entries if entry]
             if dimensions[-1:] and not min(dimensions) > 0:
-                raise ValueError(
+                raise InputError(
                     f"{line.location}: dimensions of a section must be positive, but one is "
                     f"{min(dimensions):g}."
                 )
@@ -147,13 +148,13 @@ def _number(line: Line, entry: str, wanted: str) -> float:
     try:
         return float(re.sub("[dD]", "e", entry))
     except ValueError as error:
-        raise ValueError(f"{line.location}: {shown(entry)} where {wanted} is expected.") from error
+        raise InputError(f"{line.location}: {shown(entry)} where {wanted} is expected.") from error
 
 
 def _label(line: Line, entry: str, wanted: str) -> int:
     value = _number(line, entry, wanted)
     if not value.is_integer() or value < 1:
-        raise ValueError(f"{line.location}: {shown(entry)} where {wanted} is expected.")
+        raise InputError(f"{line.location}: {shown(entry)} where {wanted} is expected.")
     return int(value)
 
 
@@ -166,7 +167,7 @@ def _nodes(blocks: list[Block], name: str) -> dict[int, tuple[float, ...]]:
             label, *coordinates = line.entries
             for entry in coordinates[:3]:
                 if len(entry) > _COORDINATE_WIDTH:
-                    raise ValueError(
+                    raise InputError(
                         f"{line.location}: the coordinate {entry} has {len(entry)} characters; "
                         f"CalculiX reads {_COORDINATE_WIDTH} and would drop the rest."
                     )
@@ -174,7 +175,7 @@ def _nodes(blocks: list[Block], name: str) -> dict[int, tuple[float, ...]]:
             number = _label(line, label, "a node number")
             nodes[number] = tuple((*values, 0.0, 0.0, 0.0)[:3])
     if not nodes:
-        raise ValueError(f"{name} has no *NODE block with nodes before its first *STEP.")
+        raise InputError(f"{name} has no *NODE block with nodes before its first *STEP.")
     return nodes
 
 
@@ -187,12 +188,12 @@ def _elements(
     types: list[str] = []
     for block in blocks:
         if block.keyword in _REFUSED:
-            raise ValueError(f"{block.head.location}: *{block.keyword}: {_REFUSED[block.keyword]}.")
+            raise InputError(f"{block.head.location}: *{block.keyword}: {_REFUSED[block.keyword]}.")
         if block.keyword != "ELEMENT":
             continue
         types.append(block.named("TYPE"))
         if types[-1].startswith("U"):
-            raise ValueError(f"{block.head.location}: {types[-1]}: {_REFUSED['USER ELEMENT']}.")
+            raise InputError(f"{block.head.location}: {types[-1]}: {_REFUSED['USER ELEMENT']}.")
         continued, n_nodes = 0, _nodes_of_type(types[-1])
         for line in block.data:
             numbers = [_label(line, e, "a node or element number") for e in line.entries if e]
@@ -201,7 +202,7 @@ def _elements(
                 elements.add(numbers[0])
             missing = [number for number in members if number not in nodes]
             if missing:
-                raise ValueError(
+                raise InputError(
                     f"{line.location}: the element has node {missing[0]}, which no *NODE block has."
                 )
             used.update(members)
@@ -209,7 +210,7 @@ def _elements(
             if continued >= n_nodes or (n_nodes == 0 and not line.text.endswith(",")):
                 continued = 0
     if not used:
-        raise ValueError(f"{name} has no *ELEMENT block with elements before its first *STEP.")
+        raise InputError(f"{name} has no *ELEMENT block with elements before its first *STEP.")
     return elements, used, tuple(dict.fromkeys(types))
 
 
@@ -237,14 +238,14 @@ def _check_supports(blocks: list[Block], nodes: set[int], sets: set[str]) -> Non
         for line in block.data:
             target, *rest = line.entries
             if target.isdigit() and int(target) not in nodes:
-                raise ValueError(
+                raise InputError(
                     f"{line.location}: the support is at node {target}, which no *NODE block has."
                 )
             if not target.isdigit() and target.upper() not in sets:
-                raise ValueError(f"{line.location}: no node set is called {shown(target)}.")
+                raise InputError(f"{line.location}: no node set is called {shown(target)}.")
             value = rest[2] if len(rest) > 2 else ""
             if value and abs(_number(line, value, "a displacement")) > _RIGID_ZERO:
-                raise ValueError(
+                raise InputError(
                     f"{line.location}: the displacement {value} is prescribed; supports of a "
                     "condensation do not move."
                 )
@@ -254,20 +255,20 @@ def _check_materials(blocks: list[Block], name: str) -> None:
     keywords = {block.keyword: block for block in reversed(blocks)}
     for lossy in _LOSSY:
         if lossy in keywords:
-            raise ValueError(
+            raise InputError(
                 f"{keywords[lossy].head.location}: *{lossy}: a reduced stiffness has a potential, "
                 "so that the material must be elastic (*ELASTIC, *HYPERELASTIC)."
             )
     if not any(keyword in keywords for keyword in _ELASTIC):
-        raise ValueError(f"{name} has no *ELASTIC or *HYPERELASTIC material.")
+        raise InputError(f"{name} has no *ELASTIC or *HYPERELASTIC material.")
     for keyword in ("DENSITY", "ELASTIC"):
         for block in blocks:
             if block.keyword == keyword and block.data:
                 line = block.data[0]
                 value = _number(line, line.entries[0], "a number")
                 if not value > 0:
-                    raise ValueError(
+                    raise InputError(
                         f"{line.location}: *{keyword} must be positive, but is {value:g}."
                     )
     if "DENSITY" not in keywords and "MASS" not in keywords:
-        raise ValueError(f"{name} has no *DENSITY: modes need a mass.")
+        raise InputError(f"{name} has no *DENSITY: modes need a mass.")

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from snrmjax.io.calculix.results import first_error
 from snrmjax.io.files import FilePath, write_atomically
+from snrmjax.numerics.rules import InputError
 
 INSTALL = (
     "CalculiX is needed and its program {program} is not on the search path: install it (Debian, "
@@ -46,9 +47,9 @@ def find_calculix(program: str, time_limit: float) -> Calculix:
     """The program on this machine. Raises `ValueError` where it is missing."""
     path = shutil.which(program)
     if path is None:
-        raise ValueError(INSTALL.format(program=program))
+        raise InputError(INSTALL.format(program=program))
     if not time_limit > 0:
-        raise ValueError(f"`time_limit` must be positive seconds, but is {time_limit}.")
+        raise InputError(f"`time_limit` must be positive seconds, but is {time_limit}.")
     return Calculix(path, float(time_limit))
 
 
@@ -61,7 +62,7 @@ def model_file(text: str, folder: FilePath) -> Path:
     try:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"the folder {target} cannot be made: {error.strerror}.") from error
+        raise InputError(f"the folder {target} cannot be made: {error.strerror}.") from error
     path = target / f"model-{deck_digest(text)}.inp"
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         write_atomically(path, text)

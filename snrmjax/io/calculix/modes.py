@@ -12,6 +12,7 @@ from snrmjax.io.calculix.deck import Deck
 from snrmjax.io.calculix.jobs import Calculix, find_calculix, model_file, run_job
 from snrmjax.io.calculix.results import eigenvalues, printed_tables
 from snrmjax.io.files import FilePath
+from snrmjax.numerics.rules import InputError
 
 ALL_NODES = "SNRMJAX_NODES"
 # Extra modes: a free structure has six rigid-body modes before the first elastic one.
@@ -140,7 +141,7 @@ def modes_of_deck(
     tables = list(printed_tables(outcome.dat, deck.nodes)) if outcome.finished else []
     if outcome.error or len(tables) != len(kept):
         reason = outcome.error or "a load case is missing"
-        raise ValueError(f"CalculiX gave no linear static load cases of {deck.name}: {reason}.")
+        raise InputError(f"CalculiX gave no linear static load cases of {deck.name}: {reason}.")
     flexibility = conjugate @ np.array([table.values.ravel() for table in tables]).T
     return DeckModes(
         ReductionBasis(
@@ -165,9 +166,9 @@ def _survey(deck: Deck, count: int, folder: FilePath, calculix: Calculix) -> Mod
     forces = [t.values.ravel() for t in tables if t.quantity == "forces"]
     if outcome.error or not shapes or len(shapes) != len(forces):
         reason = outcome.error or "it printed no modes"
-        raise ValueError(f"CalculiX gave no modes of {deck.name}: {reason}.")
+        raise InputError(f"CalculiX gave no modes of {deck.name}: {reason}.")
     if len(shapes) < count:
-        raise ValueError(
+        raise InputError(
             f"mode {count} of {deck.name} was asked for, but CalculiX found {len(shapes)}."
         )
     _check_rigid(deck, squares)
@@ -215,7 +216,7 @@ def _step(count: int) -> str:
 def _checked(numbers: Sequence[int]) -> tuple[int, ...]:
     wanted = tuple(int(number) for number in numbers)
     if not wanted or min(wanted) < 1 or len(set(wanted)) != len(wanted):
-        raise ValueError(
+        raise InputError(
             f"modes are different numbers from one, as 1, 3, 5, but {list(numbers)} are asked for."
         )
     return wanted
@@ -240,7 +241,7 @@ def _signed(
 def _check_rigid(deck: Deck, squares: Float[np.ndarray, " mode"]) -> None:
     rigid = int(np.sum(squares <= _RIGID_RATIO * np.max(np.abs(squares))))
     if rigid:
-        raise ValueError(
+        raise InputError(
             f"{deck.name} has {rigid} mode{'s' if rigid > 1 else ''} without stiffness among its "
             f"first {len(squares)}: the structure is a mechanism or not supported; add "
             "supports (*BOUNDARY)."
@@ -250,7 +251,7 @@ def _check_rigid(deck: Deck, squares: Float[np.ndarray, " mode"]) -> None:
 def _check_carried(deck: Deck, wanted: tuple[int, ...], carried: np.ndarray) -> None:
     for number, fraction in zip(wanted, carried, strict=True):
         if not fraction >= _LEAST_CARRIED:
-            raise ValueError(
+            raise InputError(
                 f"mode {number} of {deck.name} moves its nodes too little: their translations "
                 f"carry {100 * fraction:.0f} % of its inertia (torsion of a beam?); leave it out "
                 "or model it with shells or solids."

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from snrmjax.numerics.rules import InputError
+
 _HEADER = re.compile(
     r"^ (displacements|forces) \(.*\) for set \S+ and time\s+(\S+)\s*$", re.MULTILINE
 )
@@ -40,7 +42,7 @@ def printed_tables(text: str, nodes: Int[np.ndarray, " node"]) -> Iterator[Print
         table = np.array(rows, dtype=float).reshape(-1, 4)
         order = np.argsort(table[:, 0])
         if not np.array_equal(table[order, 0], nodes):
-            raise ValueError(
+            raise InputError(
                 f"a table of {head[1]} has {len(table)} rows for {len(nodes)} nodes: "
                 "it is incomplete."
             )

@@ -26,6 +26,7 @@ from snrmjax.io.calculix.jobs import (
 from snrmjax.io.calculix.modes import ALL_NODES, DeckModes, all_nodes, load_rows
 from snrmjax.io.calculix.results import last_energy, printed_tables
 from snrmjax.io.files import FilePath, write_atomically
+from snrmjax.numerics.rules import InputError
 
 CONVERGED, DIVERGED = "converged", "diverged"
 KILLED, REFUSED = "killed", "refused"
@@ -92,7 +93,7 @@ def run_static_cases(
     forces = np.atleast_2d(np.asarray(forces, dtype=float))
     kept = len(modes.basis.numbers)
     if forces.shape[1] != kept or not np.all(np.isfinite(forces)):
-        raise ValueError(
+        raise InputError(
             f"`forces` must be finite with {kept} columns, one for each mode, but has the shape "
             f"{forces.shape}."
         )
@@ -118,7 +119,7 @@ def run_static_cases(
             pool.shutdown(wait=True, cancel_futures=True)
     rows = [results[path] for path in paths]
     if rows and all(row.status in (KILLED, REFUSED) for row in rows):
-        raise ValueError(f"CalculiX ran no load case of {deck.name}: {rows[0].error}.")
+        raise InputError(f"CalculiX ran no load case of {deck.name}: {rows[0].error}.")
     displacement = np.array([row.displacement for row in rows]).reshape(len(rows), -1)
     # Like the displacement, the energy excludes the local compliance under the nodal loads.
     local = 0.5 * np.einsum("ci,ij,cj->c", forces, modes.residual_flexibility, forces)

@@ -7,6 +7,7 @@ from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.physical_units import level_reference
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 
 def with_stated_references(
@@ -41,22 +42,22 @@ def with_stated_references(
         if values is None or (of_file is None and of_map is None):
             continue
         if of_map is None and unit_of_map:
-            raise ValueError(
+            raise InputError(
                 f"{name} of {file} is in {unit_of_file}, not in {unit_of_map}: state the reference "
                 f"of the level in place of its unit, as 'dB re 1 {unit_of_map}'."
             )
         if not (of_map or of_file):
-            raise ValueError(
+            raise InputError(
                 f"{name} of {file} is a level in dB without a reference: state it in place of its "
                 f"unit, as {name}:velocity:'dB re 1 m/s' (of a force: 'dB re 1 N')."
             )
         if unit_of_file and of_file is None:
-            raise ValueError(
+            raise InputError(
                 f"{name} of {file} is in {unit_of_file} by the file, but {unit_of_map} is stated: "
                 "which of both is right?"
             )
         if np.iscomplexobj(values) or name in imaginary:
-            raise ValueError(
+            raise InputError(
                 f"{name} of {file} has real and imaginary parts, so it cannot be a level in "
                 f"{unit_of_map or unit_of_file}."
             )

@@ -9,6 +9,7 @@ from jaxtyping import Complex, Float
 from snrmjax.io.exchange.import_map import Assumptions
 from snrmjax.measure.recordings.velocity_states import number_levels
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 
 class MeasuredPart(NamedTuple):
@@ -39,7 +40,7 @@ def numbered_levels(
     if level not in ("", "file", "force", "runs") or (not level and keyed):
         keys = np.concatenate([np.full(0, 0.0) if p.key is None else p.key for p in parts])
         if not keyed:
-            raise ValueError(
+            raise InputError(
                 f"--level {level} does not exist in this file: give force, runs, file, or a column."
             )
         if len(parts) > 1:  # separate keys for each file

@@ -13,7 +13,7 @@ from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
-from snrmjax.numerics.rules import NOT_NEGATIVE
+from snrmjax.numerics.rules import NOT_NEGATIVE, InputError
 
 if TYPE_CHECKING:
     from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
@@ -213,7 +213,7 @@ class ImportMap(NamedTuple):
             responses.append(response._replace(**resolved))
             name = resolved["channel"]
             if name not in units and ":" in name and name.rsplit(":", 1)[1].isalpha():
-                raise ValueError(
+                raise InputError(
                     f"--response must be a channel and one of {', '.join(_MOTIONS)}, as "
                     f"CH2:acceleration, but is {shown(name)}."
                 )
@@ -262,7 +262,7 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
     for key, word in words.items():
         choices = KEYS[key].choices
         if choices and word not in choices:
-            raise ValueError(
+            raise InputError(
                 f"{_option(key)} must be one of {', '.join(choices)}, but is {shown(word)}"
                 f"{suggestion(word, choices)}."
             )
@@ -271,13 +271,13 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
     if "base" in words:
         _require_base(words["base"])
     if "rate" in words and not 0 < words["rate"] < float("inf"):
-        raise ValueError(f"--rate must be above zero, but is {words['rate']:g} Hz.")
+        raise InputError(f"--rate must be above zero, but is {words['rate']:g} Hz.")
     base_map = ImportMap() if map_file is None else read_import_map(map_file)
     unit, response = words.pop("unit", ""), given.get("response") or ()
     responses = tuple(response_word(word, unit) for word in response) or base_map.responses
     stated = [word for word in response if response_word(word).unit]
     if unit and stated:
-        raise ValueError(
+        raise InputError(
             f"--unit {unit} is for responses without a stated unit, but --response {stated[0]} "
             "states one: leave one of the two out."
         )
@@ -286,7 +286,7 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
     for key in RESPONSE_KEYS:
         each = given.get(key) or ()
         if each and len(each) != len(responses):
-            raise ValueError(
+            raise InputError(
                 f"{_option(key)} must be given once for each of the {len(responses)} responses, "
                 f"but is given {len(each)} times."
             )
@@ -300,7 +300,7 @@ def map_of_options(map_file: Path | None, given: Mapping[str, Any]) -> ImportMap
     ):
         doubled = [name for name in listed if listed.count(name) > 1]
         if doubled:
-            raise ValueError(f"{what} names {doubled[0]!r} twice.")
+            raise InputError(f"{what} names {doubled[0]!r} twice.")
     if unit and not responses:  # our own table has no responses to name
         words["unit"] = unit
     # Another excitation replaces the one of the map file.
@@ -315,12 +315,12 @@ def _require_base(word: str) -> None:
     stated = response_word(word)
     numbers = ImportMap(base=word).base_amplitudes
     if not stated.quantity or (numbers and not stated.unit):
-        raise ValueError(
+        raise InputError(
             f"--base must state its quantity, as CH1:acceleration:g or 0.5:acceleration:g, but "
             f"is {shown(word)}."
         )
     if not all(0 < number < float("inf") for number in numbers):
-        raise ValueError(f"--base must be above zero where it is a number, but is {shown(word)}.")
+        raise InputError(f"--base must be above zero where it is a number, but is {shown(word)}.")
 
 
 def _option(key: str) -> str:
@@ -337,7 +337,7 @@ def _stated_amplitudes(words: Sequence[str]) -> tuple[str, ...]:
         except ValueError:
             number = 0.0
         if not 0 < number < float("inf"):
-            raise ValueError(
+            raise InputError(
                 "--force-amplitude must be a positive number (in --force-unit, N by default), or z "
                 f"or name alone, but is {shown(word)}."
             )

@@ -5,6 +5,7 @@ from typing import Literal
 
 from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.laboratory.contents import LaboratoryFile
+from snrmjax.numerics.rules import InputError
 
 Content = Literal["own table", "table", "responses", "records"]
 
@@ -41,7 +42,7 @@ def refuse_unused(
     """
 
     def refuse(key: str, why: str) -> None:
-        raise ValueError(f"--{key.replace('_', '-')} has no effect {why}: leave it out.")
+        raise InputError(f"--{key.replace('_', '-')} has no effect {why}: leave it out.")
 
     for key in stated:
         if key not in _EFFECTIVE[content]:
@@ -74,7 +75,7 @@ def refuse_unused_axis(stated: Collection[str], files: Sequence[LaboratoryFile])
     for source in files:
         is_used = any(note.kind == "even_axis" for note in source.notes)
         if "frequency_step" in stated and not is_used:
-            raise ValueError(
+            raise InputError(
                 f"--frequency-step has no effect on {source.name}, which has no responses without "
                 "frequencies: leave it out."
             )
@@ -84,6 +85,6 @@ def refuse_unused_phase_unit(stated: Collection[str], used: ImportMap) -> None:
     """Raise `ValueError` where a phase unit is stated, but no phase was read."""
     read = bool(used.force_phase) or any(response.phase for response in used.responses)
     if "phase_unit" in stated and not read:
-        raise ValueError(
+        raise InputError(
             "--phase-unit has no effect: no phase column is read (--phase names one): leave it out."
         )

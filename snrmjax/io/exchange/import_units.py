@@ -17,6 +17,7 @@ from snrmjax.io.laboratory.physical_units import (
 from snrmjax.measure.recordings.channels import DERIVATIVE, SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
+from snrmjax.numerics.rules import InputError
 
 AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
 """Factors to peak amplitude for sinusoidal signals."""
@@ -51,7 +52,7 @@ def require_name(option: str, name: str, known: Iterable[str], what: str, file: 
     names = list(known)
     if name not in names:
         near = near_miss(name, names)
-        raise ValueError(
+        raise InputError(
             f"{option} names {name!r}, but {file} has the {what} {', '.join(names)}"
             f"{f' (did you mean {near}?)' if near else ''}."
         )
@@ -78,15 +79,15 @@ def amplitude_of_name(file: str) -> tuple[float, str] | None:
 def force_meaning(mapping: ImportMap, file_unit: str, what: str) -> Force:
     """The unit of the force. Raises `ValueError` with a question where it is not stated."""
     if mapping.force_unit and level_reference(file_unit) is not None:
-        raise ValueError(f"{what} is a level in {file_unit}, not in {mapping.force_unit}.")
+        raise InputError(f"{what} is a level in {file_unit}, not in {mapping.force_unit}.")
     unit = mapping.force_unit or file_unit
     if not unit:
-        raise ValueError(
+        raise InputError(
             f"in which unit is {what}? State it: --force-unit N (or lbf, V for a drive voltage)."
         )
     meaning = _meaning(unit, "--force-unit")
     if meaning.dimension not in ("force", "voltage"):
-        raise ValueError(
+        raise InputError(
             f"{what} must be a force or a voltage, but its unit {unit} is of {meaning.dimension}: "
             "--force names another channel, --force-unit another unit, and --base the motion of a "
             "base."
@@ -124,7 +125,7 @@ def motion_meaning(
     Raises `ValueError` with a question where they are not stated or contradict one another.
     """
     if unit and level_reference(file_unit) is not None:
-        raise ValueError(
+        raise InputError(
             f"{channel} is a level in {file_unit}, not in {unit}: give the response itself."
         )
     stated = unit or file_unit
@@ -132,14 +133,14 @@ def motion_meaning(
         of: Quantity = next((known for known in SI_UNIT if known == quantity), "velocity")
         example = f"{channel}:{of}:{SI_UNIT[of]}"
         others = ", or --unit for all responses" if option == "--response" else ""
-        raise ValueError(f"in which unit is {channel}? State it: {option} {example}{others}.")
+        raise InputError(f"in which unit is {channel}? State it: {option} {example}{others}.")
     stated_meaning = _meaning_or_none(stated)
     is_per_force = stated_meaning is not None and stated_meaning.per_force
     if is_per_force and (over is None or over.is_voltage or over.motion is not None):
         way = "give --over-force, with the force's column or amplitude in a unit of force"
         if over is not None:
             way = f"the divisor of --over-force is in {over.unit}, which is no unit of force"
-        raise ValueError(f"{channel} is a response per force by its unit {stated}: {way}.")
+        raise InputError(f"{channel} is a response per force by its unit {stated}: {way}.")
     below = 1.0 if over is None or is_per_force else over.factor
     if over is not None and not is_per_force and "/" in stated:
         numerator, _, divisor = (part.strip("() ") for part in stated.rpartition("/"))
@@ -148,18 +149,18 @@ def motion_meaning(
             stated, below = numerator, divisor_meaning.factor
     meaning = _meaning(stated, "--unit")
     if meaning.per_volt:
-        raise ValueError(
+        raise InputError(
             f"{stated} of {channel} is a sensitivity: give the unit of the channel's numbers, as "
             "--unit g, or for volts the motion per volt, as --unit '9.8 m/s^2'."
         )
     if meaning.dimension not in ("displacement", "velocity", "acceleration"):
-        raise ValueError(
+        raise InputError(
             f"{channel} must be a displacement, velocity or acceleration, but its unit {stated} is "
             f"of {meaning.dimension}: {'give' if unit else '--unit states'} the motion that the "
             "number 1 means (a sensor of 100 mV/g: --unit '10 g' per volt)."
         )
     if quantity and quantity != meaning.dimension:
-        raise ValueError(
+        raise InputError(
             f"{channel} is called {quantity} ({option}), but its unit {stated} is of "
             f"{meaning.dimension}: which of both is right?"
         )
@@ -176,13 +177,13 @@ def amplitude_factor(mapping: ImportMap, units: Mapping[str, str], assumed: Assu
     kinds = all_kinds - {""}
     if mapping.amplitude:
         if of_units - {mapping.amplitude}:
-            raise ValueError(
+            raise InputError(
                 f"--amplitude states {mapping.amplitude}, but a unit states {min(of_units)}: "
                 "which is right?"
             )
         return float(AMPLITUDE_FACTORS[mapping.amplitude])
     if len(kinds) > 1 or (kinds and "" in all_kinds and kinds != {"peak"}):
-        raise ValueError(
+        raise InputError(
             f"names and units state {' and '.join(sorted(kinds))} for some columns but not for "
             "others: which holds for all? --amplitude peak, rms or peak_to_peak."
         )
@@ -199,7 +200,7 @@ def frequency_in_rad(
     unit = mapping.frequency_unit or file_unit
     if not unit:
         if mapping.frequency.lower().rsplit(".", 1)[-1] in ("w", "omega", "om"):
-            raise ValueError(
+            raise InputError(
                 f"is {mapping.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
             )
         assumed.add("frequency_unit", Fact("nothing_is_said"), "Hz")
@@ -208,7 +209,7 @@ def frequency_in_rad(
     meaning = _meaning(unit, "--frequency-unit")
     if meaning.dimension != "frequency":
         way = "--frequency-unit is Hz or rad/s" if mapping.frequency_unit else ""
-        raise ValueError(
+        raise InputError(
             f"{mapping.frequency} must be a frequency, but its unit {unit} is of "
             f"{meaning.dimension}: {way or '--frequency names another column'}."
         )
@@ -228,7 +229,7 @@ def phase_in_rad(
     """
     stated = unit_meaning(file_unit) if file_unit else None
     if stated and stated.dimension != "angle" and not mapping.phase_unit:
-        raise ValueError(
+        raise InputError(
             f"{column} must be an angle, but its unit is {file_unit}: --phase names another "
             "column, --phase-unit its unit."
         )
@@ -239,7 +240,7 @@ def phase_in_rad(
     assumed.unit("phase_unit", mapping.phase_unit, of_file)
     if not unit:
         if not np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
-            raise ValueError(f"is {column} in degrees or in radians? --phase-unit deg or rad.")
+            raise InputError(f"is {column} in degrees or in radians? --phase-unit deg or rad.")
         unit = "deg"
         assumed.add("phase_unit", Fact("phase_beyond_two_turns", column=column), unit)
     if not mapping.phase_sign:
@@ -259,4 +260,4 @@ def _meaning(unit: str, option: str) -> UnitMeaning:
     try:
         return unit_meaning(unit)
     except ValueError as error:
-        raise ValueError(f"{str(error).rstrip('.')}: {option} states it.") from error
+        raise InputError(f"{str(error).rstrip('.')}: {option} states it.") from error

@@ -36,6 +36,7 @@ from snrmjax.measure.states import (
 )
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 
 class Imported(NamedTuple):
@@ -86,7 +87,7 @@ def import_files(
         ]
     if len({type(dataset.content) for dataset in datasets}) > 1:
         listed = ", ".join(f"{dataset.file}: {dataset.name}" for dataset in datasets)
-        raise ValueError(f"files of one test must hold datasets of one kind, but have {listed}.")
+        raise InputError(f"files of one test must hold datasets of one kind, but have {listed}.")
     if mapping.dataset == "" and len(datasets) == 1:
         mapping = mapping._replace(dataset=datasets[0].name)
     file = datasets[0].file
@@ -151,9 +152,9 @@ def _datasets(
     if named or (len(parts) == 1 and not strict):
         return named or parts
     if mapping.dataset:
-        raise ValueError(f"--dataset names {mapping.dataset!r}, but {source.name} has {names}.")
+        raise InputError(f"--dataset names {mapping.dataset!r}, but {source.name} has {names}.")
     if len(parts) > len(source.recordings):
-        raise ValueError(f"which part of {source.name} is meant? --dataset names it, of {names}.")
+        raise InputError(f"which part of {source.name} is meant? --dataset names it, of {names}.")
     return parts
 
 
@@ -164,7 +165,7 @@ def _records(
     notes: list[Fact],
 ) -> Imported:
     if mapping.phase_sign == "lag":
-        raise ValueError(
+        raise InputError(
             f"--phase-sign must be left out of the time records of {records[0][1]}: phases follow "
             "from force and motion there. Change the sign of an inverted sensor in the model's "
             "`shape`."
@@ -213,7 +214,7 @@ def _phasors(
     """Steady states of tables and frequency responses."""
     velocity = np.concatenate([part.velocity for part in parts])
     if not np.any(np.abs(velocity) > 0):
-        raise ValueError(f"{file} has only zero responses.")
+        raise InputError(f"{file} has only zero responses.")
     keyed = all(part.key is not None for part in parts)
     number, rule = numbered_levels(parts, level or (used.level if keyed else ""), assumed)
     amplitude = np.concatenate([part.force for part in parts])

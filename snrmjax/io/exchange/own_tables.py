@@ -16,6 +16,7 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 
 def is_own_file(path: Path) -> bool:
@@ -93,7 +94,7 @@ def _with_base(states: SteadyStates, mapping: ImportMap) -> SteadyStates:
             "", mapping.force_unit, "", "the base", option="--force-unit"
         )
         if quantity != "acceleration":
-            raise ValueError(
+            raise InputError(
                 f"--force-unit of a table with a base's acceleration must be one of acceleration, "
                 f"but {mapping.force_unit} is of {quantity}."
             )

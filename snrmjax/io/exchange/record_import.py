@@ -17,6 +17,7 @@ from snrmjax.measure.recordings.velocity_states import Levels
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 ENDINGS = {"velocity": "m_s", "acceleration": "m_s2", "displacement": "m"}
 """Unit suffixes of motion columns."""
@@ -32,7 +33,7 @@ def ask_for_rate(notes: Iterable[Fact | str], rate: float, file: str) -> None:
     """
     for note in notes:
         if not rate and isinstance(note, Fact) and note.kind == "rate_left_open":
-            raise ValueError(
+            raise InputError(
                 f"which sampling rate has {file}? Its step of {note['step']} s has few digits, "
                 f"so that frequencies may be off by {note['off']:.1g} %. Confirm it by "
                 f"`--rate {note['rate']:g}`, or state another."
@@ -46,7 +47,7 @@ def at_stated_rate(record: TimeRecording, rate: float, file: str) -> TimeRecordi
     """
     own = record.sampling_rate
     if rate and abs(rate / own - 1) > _FEW_DIGITS:
-        raise ValueError(
+        raise InputError(
             f"--rate states {rate:g} Hz, but {file} {own:g} Hz: which is right? Rounding of the "
             "file's time step does not explain that much."
         )
@@ -62,7 +63,7 @@ def mapped_record(
     """
     if not mapping.responses:
         names = ", ".join(record.channel_names)
-        raise ValueError(
+        raise InputError(
             f"which channel of {file} is the response? --response CHANNEL:acceleration (or "
             f"velocity, displacement) names it, of {names}."
         )
@@ -82,7 +83,7 @@ def mapped_record(
         )
         assumed.unit("force_unit", mapping.force_unit, unit)
     if mapping.base_amplitudes:
-        raise ValueError(
+        raise InputError(
             f"--base must name the channel of the base's motion in the time records of {file}, not "
             f"a number, of {', '.join(record.channel_names)}."
         )
@@ -97,7 +98,7 @@ def mapped_record(
         k = _number(record, response.channel, file, "--response")
         old = channels[k]
         if response.channel in (mapping.load, mapping.drive):
-            raise ValueError(
+            raise InputError(
                 f"{response.channel} of {file} is named both as the response and as the excitation."
             )
         if old.quantity == "voltage" and not response.unit:
@@ -130,13 +131,13 @@ def import_record(
     if mapping.record in ("decay", "broadband"):
         return None, mapping, (), None
     if not mapping.load:
-        raise ValueError(
+        raise InputError(
             f"which channel of {file} is the force? --force CHANNEL names it, of "
             f"{', '.join(record.channel_names)}; --base CHANNEL:acceleration is the motion of a "
             "base, and --record decay states that there is none."
         )
     if mapping.level and mapping.level not in (*_DIRECT, "auto", "file"):
-        raise ValueError(
+        raise InputError(
             f"--level must be one of force, drive, runs or file for time records, but is "
             f"{mapping.level!r}."
         )
@@ -166,8 +167,8 @@ def import_record(
             assumed.add("level", Fact("levels_found", n=len(np.unique(states.level))))
         return states, mapping._replace(record=kind, level=mapping.level or level), notes, counts
     if mapping.record:
-        raise ValueError(f"{file} does not read as {failures[0]}")
-    raise ValueError(
+        raise InputError(f"{file} does not read as {failures[0]}")
+    raise InputError(
         f"what is the record of {file}: --record steps, sweep, decay or broadband? It was read "
         f"neither as {' Nor as '.join(failures)}"
     )
@@ -194,4 +195,4 @@ def _number(record: TimeRecording, name: str, file: str, option: str) -> int:
     try:
         return channel_number(record.channels, name)
     except ValueError as error:
-        raise ValueError(f"{option}: in {file} {error}") from error
+        raise InputError(f"{option}: in {file} {error}") from error

@@ -20,6 +20,7 @@ from snrmjax.io.laboratory.physical_units import level_reference
 from snrmjax.measure.recordings.channels import SI_UNIT, Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _FREQUENCY, _FORCE, _SET = "frequency of the lines", "reference force", "set"
 _RULES = ("force", "runs", "file")
@@ -52,12 +53,12 @@ class _Sets(NamedTuple):
             elif len(names) > 1:
                 listed = ", ".join(names)
                 if self.has_force:
-                    raise ValueError(
+                    raise InputError(
                         f"{force} of {file} has {len(names)} references ({listed}): export it "
                         f"and the responses relative to one of them, or name a reference by "
                         f"{option}."
                     )
-                raise ValueError(
+                raise InputError(
                     f"which reference of {file} is the force? --force names it, of {listed} "
                     "(--base NAME:acceleration, if it is the motion of a base)."
                 )
@@ -84,7 +85,7 @@ class _Sets(NamedTuple):
         if stated == (BY_NAME,):
             amplitude = amplitude_of_name(file)
             if amplitude is None or amplitude[1] != "N":
-                raise ValueError(
+                raise InputError(
                     f"the name of {file} must state one amplitude in newtons, as frf_0.4N.uff does."
                 )
             return np.full(n, amplitude[0])
@@ -92,19 +93,19 @@ class _Sets(NamedTuple):
         if not stated:
             levels = ", ".join(f"{value:g}" for value in self.z)
             way = f"z if they are the z axis' ({levels}), else N" if has_z else "N, one for all or"
-            raise ValueError(
+            raise InputError(
                 f"which force amplitude had {file}, whose responses are per unit force? "
                 f"--force-amplitude {way} one a set ({n}); `snrmjax modes` reads frequency "
                 "responses directly."
             )
         if stated == ("z",) and not (has_z and np.all(np.asarray(self.z) > 0)):
-            raise ValueError(
+            raise InputError(
                 f"--force-amplitude z needs positive values on the z axis, which {file} lacks: "
                 "state N."
             )
         values = np.asarray(self.z if stated == ("z",) else [float(word) for word in stated])
         if values.size not in (1, n):
-            raise ValueError(
+            raise InputError(
                 f"--force-amplitude must be one for all or one for each of the {n} sets of "
                 f"{file}, but {values.size} are stated."
             )
@@ -114,7 +115,7 @@ class _Sets(NamedTuple):
         """The stated amplitude of the base's motion of each set."""
         stated, n = self.mapping.base_amplitudes, len(self.sets)
         if len(stated) not in (1, n):
-            raise ValueError(
+            raise InputError(
                 f"which amplitude had the base of {self.file}, whose responses are per base "
                 "motion? --base 0.5:acceleration:g states one for all"
                 + (f", or one for each of the {n} sets with commas." if n > 1 else ".")
@@ -129,7 +130,7 @@ class _Sets(NamedTuple):
             for each, reference in zip(self.sets, self.references(), strict=True):
                 channel = each.references[reference]
                 if channel.quantity not in ("unknown", base.motion):
-                    raise ValueError(
+                    raise InputError(
                         f"--base states {base.motion}, but the responses of {file} are relative to "
                         f"{channel.name}, of {channel.quantity}: which of both is right?"
                     )
@@ -138,7 +139,7 @@ class _Sets(NamedTuple):
         pairs = zip(self.sets, self.references(), strict=True)
         for channel in [each.references[reference] for each, reference in pairs]:
             if mapping.force_unit and channel.si_unit not in ("", mapping.force_unit):
-                raise ValueError(
+                raise InputError(
                     f"--force-unit states {mapping.force_unit}, but the responses of {file} are "
                     f"per {channel.name} in {channel.si_unit}, also the unit of --force-amplitude: "
                     "leave --force-unit out."
@@ -162,15 +163,15 @@ def import_responses(
     """
     if not mapping.responses:
         named = ", ".join(dict.fromkeys(name for each in sets for name in _names(each.responses)))
-        raise ValueError(
+        raise InputError(
             f"which channel of {file} is the response? --response CHANNEL names it, of {named}."
         )
     if mapping.level not in ("", "z", "order", *_RULES):
-        raise ValueError(
+        raise InputError(
             f"--level must be order, z, force or file of {file}, not {mapping.level!r}."
         )
     if mapping.level == "z" and not np.isfinite(z).all():
-        raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
+        raise InputError(f"--level z: {file} states no value on the z axis: --level order.")
     source = _Sets(sets, z, mapping, file)
     n_lines = [each.frequency.size for each in sets]
     numbers = z if mapping.level == "z" else np.arange(1.0, len(sets) + 1)
@@ -183,7 +184,7 @@ def import_responses(
     as_table = mapping._replace(frequency=_FREQUENCY, frequency_unit="", level=rule)
     if source.has_force:
         if mapping.force_amplitude:
-            raise ValueError(
+            raise InputError(
                 f"--force-amplitude has no effect: {mapping.load} of {file} has the amplitudes."
             )
         name = mapping.load

@@ -27,6 +27,7 @@ from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import UNNAMED_SENSOR
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
+from snrmjax.numerics.rules import InputError
 
 _DECIBELS = re.compile(r"(?<![^\W\d_])d[Bb](?![^\W\d_])")
 _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
@@ -54,7 +55,7 @@ class _Source(NamedTuple):
         """A column of real numbers that an option names."""
         values = self.column(name, option)
         if np.iscomplexobj(values):
-            raise ValueError(f"{option} must name a column of real numbers, but {name} is complex.")
+            raise InputError(f"{option} must name a column of real numbers, but {name} is complex.")
         return values.astype(float)
 
     def phasors(self, values: np.ndarray) -> np.ndarray:
@@ -99,7 +100,7 @@ def import_table(
         assumed,
     )
     if not mapping.responses:
-        raise ValueError(
+        raise InputError(
             f"which column of {file} is the response? --response COLUMN:velocity (or acceleration, "
             f"displacement) names it, of {source.listed}."
         )
@@ -151,7 +152,7 @@ def _frequency_column(source: _Source) -> str:
     """The unique column that is a frequency by name or unit."""
     columns = source.with_role("frequency")
     if len(columns) != 1:
-        raise ValueError(
+        raise InputError(
             f"which column of {source.file} is the frequency? --frequency names it, of "
             f"{', '.join(columns) or source.listed}; --frequency-start and --frequency-step state "
             "frequencies without a column."
@@ -172,12 +173,12 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
             return _by_name(source)
         if amplitudes and (len(amplitudes) > 1 or amplitudes[0] == "z"):
             option = "--base" if mapping.base else "--force-amplitude"
-            raise ValueError(
+            raise InputError(
                 f"{option} must be one number for {file}, a table of states without sets or a z "
                 f"axis, but is {','.join(map(str, amplitudes))}."
             )
         if not amplitudes:
-            raise ValueError(
+            raise InputError(
                 f"which column of {file} is the force? --force COLUMN names it, of "
                 f"{source.listed}; --force-amplitude N states one without a column, and --base "
                 "COLUMN:acceleration the motion of a base."
@@ -190,7 +191,7 @@ def _force(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
         source.assumed.unit("force_unit", mapping.force_unit, source.unit(name))
     force = load_meaning(mapping, source.unit(name), f"{name} of {file}")
     if not np.iscomplexobj(raw) and np.nanmin(raw, initial=1.0) < 0:
-        raise ValueError(
+        raise InputError(
             f"{name} of {file} has negative amplitudes: {option} names another column."
         )
     force_phasor = source.phasors(raw) * force.factor
@@ -206,7 +207,7 @@ def _by_name(source: _Source) -> tuple[Complex[np.ndarray, " row"], Force]:
     mapping, file = source.mapping, source.file
     stated = amplitude_of_name(file)
     if stated is None:
-        raise ValueError(
+        raise InputError(
             f"the name of {file} must state one amplitude with its unit, as sine_0.4N.csv does: "
             "rename it, or give --force-amplitude a number."
         )
@@ -240,14 +241,14 @@ def _response(
         assumed.add(f"response {number}.quantity", Fact("quantity_by_unit", unit=unit))
     imaginary, phase = response.imaginary, response.phase
     if phase and (imaginary or np.iscomplexobj(values)):
-        raise ValueError(
+        raise InputError(
             f"--phase {phase} has no effect: {name} of {file} "
             + (f"has the imaginary part {imaginary}." if imaginary else "is complex.")
         )
     if not (np.iscomplexobj(values) or imaginary or phase):
         imaginary, phase = _partner(source, name)
         if not (imaginary or phase):
-            raise ValueError(
+            raise InputError(
                 f"where is the phase of {name} of {file}? --phase COLUMN names it, or "
                 f"--imaginary COLUMN where {name} is a real part; there are {source.listed}."
             )
@@ -263,7 +264,7 @@ def _response(
             assumed.add("phase_sign", Fact("imaginary_ahead_of_the_force"), "lead")
     else:
         if np.nanmin(values, initial=0.0) < 0:
-            raise ValueError(
+            raise InputError(
                 f"{name} of {file} has negative amplitudes: is it a real part? "
                 "--imaginary COLUMN names the other one."
             )
@@ -311,7 +312,7 @@ def _refuse_doubled(source: _Source) -> None:
     """Raise `ValueError` where one column is both excitation and response."""
     for response in source.mapping.responses:
         if response.channel == source.mapping.load:
-            raise ValueError(
+            raise InputError(
                 f"{response.channel} of {source.file} is named both as the response and as the "
                 "excitation."
             )
@@ -326,7 +327,7 @@ def _level(source: _Source) -> tuple[str, np.ndarray | None]:
         return rule, source.real(rule, "--level")
     if rule:
         near = near_miss(rule, columns)
-        raise ValueError(
+        raise InputError(
             f"--level must be force, runs, file or a column of {source.file} "
             f"({source.listed}), but is {rule!r}{f' (did you mean {near}?)' if near else ''}."
         )
@@ -339,11 +340,11 @@ def _level(source: _Source) -> tuple[str, np.ndarray | None]:
 
 def _check(omega: Float[np.ndarray, " row"], force: Float[np.ndarray, " row"], file: str) -> None:
     if not omega.size:
-        raise ValueError(f"no row of {file} has frequency, force and response.")
+        raise InputError(f"no row of {file} has frequency, force and response.")
     for what, values in (("frequencies", omega), ("forces", force)):
         bad = np.flatnonzero(~(values > 0))
         if bad.size:
-            raise ValueError(
+            raise InputError(
                 f"{what} must be above zero, but row {bad[0] + 1} of the complete rows of {file} "
                 f"has {values[bad[0]]:g}."
             )
@@ -379,7 +380,7 @@ def _errors(
     of_level, name = response.channel in source.levels, response.amplitude_std
     is_level = bool(_DECIBELS.search(name)) or level_reference(source.unit(name)) is not None
     if name and of_level != is_level and (is_level or source.unit(name)):
-        raise ValueError(
+        raise InputError(
             f"{name} of {source.file} must be standard deviations in the unit of "
             f"{response.channel}, but one of both is in dB: --amplitude-std names another column."
         )
@@ -414,7 +415,7 @@ def _deviations(source: _Source, name: str, option: str) -> Float[np.ndarray, " 
     values = np.real(source.column(name, option)).astype(float)
     bad = np.flatnonzero(values < 0)
     if bad.size:
-        raise ValueError(
+        raise InputError(
             f"{name} of {source.file} must be standard deviations, not negative, but row "
             f"{bad[0] + 1} has {values[bad[0]]:g}: {option} names another column."
         )

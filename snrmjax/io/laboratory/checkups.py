@@ -6,6 +6,7 @@ from snrmjax.doctor.findings import Checkup
 from snrmjax.io.files import FilePath, file_name, write_atomically
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.rules import InputError
 
 
 def write_checkup(path: FilePath, checkup: Checkup) -> None:
@@ -21,5 +22,5 @@ def read_recordings(path: FilePath) -> tuple[TimeRecording, ...]:
     """The time records of a laboratory's file. Raises `ValueError` where there are none."""
     recordings = read_laboratory_file(path).recordings
     if not recordings:
-        raise ValueError(f"{file_name(path)} holds no time record.")
+        raise InputError(f"{file_name(path)} holds no time record.")
     return tuple(recordings)

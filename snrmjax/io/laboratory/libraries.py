@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from snrmjax.numerics.rules import InputError
+
 
 def library(module: str, purpose: str) -> Any:
     """A library of the extra `lab`, imported when first needed.
@@ -14,7 +16,7 @@ def library(module: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ValueError(
+        raise InputError(
             f"{purpose} needs the package {module.split('.')[0]}, which is not installed: "
             "pip install 'snrmjax[lab]'"
         ) from error
@@ -31,4 +33,4 @@ def damaged_if_it_fails(file: str, what: str) -> Iterator[None]:
     except Exception as error:
         message = " ".join(str(error).split())
         why = f" ({message[:160]})" if message else f" ({type(error).__name__})"
-        raise ValueError(f"{file} is damaged or is not {what}{why}.") from error
+        raise InputError(f"{file} is damaged or is not {what}{why}.") from error

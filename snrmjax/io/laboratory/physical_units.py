@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, get_args
 
 from snrmjax.io.files import shown
 from snrmjax.measure.recordings.channels import Quantity
+from snrmjax.numerics.rules import InputError
 
 _LONGEST = 40
 _ALLOWED = re.compile(r"[A-Za-zµμΩ°%/*^·.()0-9 _+\-⁻¹²³]*")
@@ -260,8 +261,8 @@ def is_per_force(text: str) -> bool:
         return False
 
 
-def _not_understood(text: str, why: str = "") -> ValueError:
-    return ValueError(f"{shown(text)} is not understood as a unit{why}.")
+def _not_understood(text: str, why: str = "") -> InputError:
+    return InputError(f"{shown(text)} is not understood as a unit{why}.")
 
 
 def _product(first_powers: _Powers, other: _Powers, power: int) -> _Powers:
@@ -309,7 +310,7 @@ def _evaluated(node: ast.expr) -> tuple[Decimal, _Powers]:
             scale, powers = _evaluated(left)
             exponent = ast.literal_eval(right)
             return scale**exponent, _product((0, 0, 0, 0, 0), powers, exponent)
-    raise ValueError("neither a product nor a power of units")
+    raise InputError("neither a product nor a power of units")
 
 
 def _in_another_case(name: str) -> str:

@@ -9,6 +9,7 @@ from snrmjax.io.laboratory.arrays.matlab_files import is_old_matlab
 from snrmjax.io.laboratory.arrays.octave_text import is_octave_text
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.record_tables import with_named_channels
+from snrmjax.numerics.rules import InputError
 
 _ROOM = "snrmjax.io.laboratory"
 _READERS: dict[Kind, tuple[str, str]] = {
@@ -47,7 +48,7 @@ def read_laboratory_file(
     contents: LaboratoryFile = read(Path(path), *options)
     if contents.is_empty:
         why = f": {' '.join(map(str, contents.notes[:_MOST_REASONS]))}" if contents.notes else "."
-        raise ValueError(f"{contents.name} holds nothing that could be read{why}")
+        raise InputError(f"{contents.name} holds nothing that could be read{why}")
     return contents._replace(
         recordings=tuple(map(with_named_channels, contents.recordings)),
         tables=tuple(table.with_named_units() for table in contents.tables),
@@ -58,7 +59,7 @@ def _kind(path: FilePath) -> Kind:
     """The format of a file."""
     name, head = file_name(path), read_bytes(path, _HEAD)
     if not head:
-        raise ValueError(f"{name} is empty.")
+        raise InputError(f"{name} is empty.")
     if any(head[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048)):  # after a user block
         matlab = head.startswith(b"MATLAB 7.3") or Path(path).suffix.lower() == ".mat"
         return "matlab" if matlab else "hdf5"
@@ -74,7 +75,7 @@ def _kind(path: FilePath) -> Kind:
     if first == b"    -1":
         return "uff"
     if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):  # UTF-16 text
-        raise ValueError(f"{name} is of no known format ({_description(head)}).")
+        raise InputError(f"{name} is of no known format ({_description(head)}).")
     return "csv"
 
 

@@ -15,6 +15,7 @@ from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
+from snrmjax.numerics.rules import InputError
 
 _COLUMNS: dict[str, Quantity] = {
     "force_n": "force",
@@ -52,7 +53,7 @@ def read_record_table(path: FilePath) -> TimeRecording:
     time = cells.numbers("time_s")
     values = np.stack([cells.numbers(channel.name) for channel in channels])
     if len(time) < _FEWEST:
-        raise ValueError(
+        raise InputError(
             f"a time record needs {_FEWEST} samples at least, but {file} has {len(time)}."
         )
     start = float(time[0])
@@ -86,7 +87,7 @@ def _named(channel: Channel) -> Channel:
 def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
     """Channels of the known columns, and notes on the others."""
     if "time_s" not in names:
-        raise ValueError(f"{file} is no time record: it has no column `time_s`.")
+        raise InputError(f"{file} is no time record: it has no column `time_s`.")
     channels, others = [], []
     for name in names:
         sensor, _, column = name.rpartition(".")
@@ -100,14 +101,14 @@ def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
     points = [channel.point for channel in channels if channel.quantity not in ("force", "voltage")]
     if not points:
         near = "".join(suggestion(name, _MOTIONS) for name in others[:1])
-        raise ValueError(
+        raise InputError(
             f"a time record needs {', '.join(_MOTIONS[:2])} or {_MOTIONS[2]}, but {file} has "
             f"{', '.join(names)}{near}."
         )
     for point in points:
         if points.count(point) > 1:
             whose = f"sensor {point}" if point else "one sensor"
-            raise ValueError(
+            raise InputError(
                 f"{file} has two motions of {whose}: keep one, or name sensors as in "
                 "`tip.velocity_m_s`."
             )
@@ -128,12 +129,12 @@ def _sampling_rate(time: Float[np.ndarray, " row"], file: str) -> tuple[float, l
         return printed.rate, [] if printed.note is None else [printed.note]
     falls = np.flatnonzero(steps <= 0)
     if falls.size:
-        raise ValueError(
+        raise InputError(
             f"`time_s` must rise, but row {falls[0] + 3} of {file} has {time[falls[0] + 1]:.9g} "
             f"after {time[falls[0]]:.9g}."
         )
     gap = int(np.argmax(np.abs(steps - typical)))
-    raise ValueError(
+    raise InputError(
         f"`time_s` must be evenly spaced, but in row {gap + 3} of {file} it steps by "
         f"{steps[gap]:.6g} s, elsewhere by {typical:.6g} s: resample the record."
     )

@@ -22,6 +22,7 @@ from snrmjax.measure.recordings.time_recording import (
     time_recording,
 )
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _UNITS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "Units")
 _MOST_CHANNELS = 4096
@@ -52,7 +53,7 @@ class _TdmsSamples(AbstractSamples):
                 first = start + self._skipped[k]
                 rows.append(self._channels[k].read_data(first, max(0, stop - start)))
         if any(len(row) != stop - start for row in rows):
-            raise ValueError(f"{self._name} is damaged: samples {start} to {stop} are missing.")
+            raise InputError(f"{self._name} is damaged: samples {start} to {stop} are missing.")
         return np.stack(rows)
 
 
@@ -119,14 +120,14 @@ def _contents(file: BinaryIO) -> Any:
 def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str) -> None:
     """Refuse more samples than the file can hold, and too many channels."""
     if len(counted) > _MOST_CHANNELS:
-        raise ValueError(f"{file} has {len(counted)} channels, more than {_MOST_CHANNELS}.")
+        raise InputError(f"{file} has {len(counted)} channels, more than {_MOST_CHANNELS}.")
     total = sum(
         length * channel.dtype.itemsize
         for channel, length, _ in counted
         if channel.dtype.kind in "biufc"
     )
     if total > 8 * size:  # scaled channels give doubles for bytes
-        raise ValueError(f"{file} states {total} bytes of samples, but has {size} bytes.")
+        raise InputError(f"{file} states {total} bytes of samples, but has {size} bytes.")
 
 
 def _start_times(channels: Sequence[Any]) -> dict[str, float]:

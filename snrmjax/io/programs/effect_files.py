@@ -11,6 +11,7 @@ from types import ModuleType
 from snrmjax.io.files import read_text
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effects import known_effects, register_effect
+from snrmjax.numerics.rules import InputError
 
 _loaded: dict[Path, str] = {}  # file and digest, in loading order
 
@@ -34,9 +35,9 @@ def load_effects(path: str | os.PathLike[str]) -> None:
             if effect not in known_effects().values():
                 register_effect(effect)
     except ValueError as error:
-        raise ValueError(f"{file.name} cannot be loaded: {error}") from error
+        raise InputError(f"{file.name} cannot be loaded: {error}") from error
     if not {*known_effects()} - before:
-        raise ValueError(
+        raise InputError(
             f"{file.name} defines no effect: a class with a `kind`, a parameter and a `force`, "
             "derived from `snrmjax.model.AbstractMemoryless` or another base of effects."
         )
@@ -53,7 +54,7 @@ def _run(file: Path) -> ModuleType:
     name = f"own_effects_{hashlib.sha256(os.fsencode(file)).hexdigest()[:16]}"
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None:
-        raise ValueError(f"{file.name} is no Python file: its name must end in .py.")
+        raise InputError(f"{file.name} is no Python file: its name must end in .py.")
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     if str(file.parent) not in sys.path:
         sys.path.append(str(file.parent))
@@ -62,7 +63,7 @@ def _run(file: Path) -> ModuleType:
     except (Exception, SystemExit) as error:  # a user's file may raise anything
         del sys.modules[name]
         message = (str(error).splitlines() or [""])[0].rstrip(".")
-        raise ValueError(
+        raise InputError(
             f"{file.name} cannot be loaded: {type(error).__name__}{message and f': {message}'}."
         ) from error
     return module

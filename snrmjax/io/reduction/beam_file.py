@@ -49,7 +49,7 @@ from snrmjax.condense.beam_source import beam_source
 from snrmjax.condense.reduction import ReductionSource, run_load_cases
 from snrmjax.io.files import FilePath, file_name, read_text
 from snrmjax.io.toml_table import TomlTable, parsed_toml
-from snrmjax.numerics.rules import BELOW_ONE, FRACTION, NOT_NEGATIVE, POSITIVE
+from snrmjax.numerics.rules import BELOW_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, InputError
 
 MOST_ELEMENTS = 400
 SUPPORTS = ("clamped", "pinned", "free")
@@ -87,7 +87,7 @@ def read_beam_description(path: FilePath) -> BeamDescription:
         numbers |= {f"supports.{side}.{key}": stiffness for key, stiffness in springs}
     missing = unconstrained_motion(numbers)  # a mechanism has no static load cases
     if missing is not None:
-        raise ValueError(f"{supports.location} leave a mechanism: {missing}.")
+        raise InputError(f"{supports.location} leave a mechanism: {missing}.")
     masses_at = []
     for k, mass in enumerate(top.tables(_POINT_MASS, file), 1):
         mass.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
@@ -172,7 +172,7 @@ def _geometry(geometry: TomlTable, section: TomlTable) -> dict[str, float]:
     if "radius_m" not in geometry.entries:
         return {**known, RISE: rise}
     if "rise_m" in geometry.entries:
-        raise ValueError(f"{geometry.location} has both `radius_m` and `rise_m`: one is enough.")
+        raise InputError(f"{geometry.location} has both `radius_m` and `rise_m`: one is enough.")
     radius = geometry.number("radius_m", POSITIVE)
     if not length < 2 * MAX_RISE * radius:
         raise geometry.refusal("radius_m", f"above {length / (2 * MAX_RISE):.4g}", radius)
@@ -202,7 +202,7 @@ def _stiffness(springs: TomlTable, key: str) -> float:
 def _force(table: TomlTable) -> float | None:
     table.check_keys((), ("distribution", "at"))
     if "distribution" in table.entries and "at" in table.entries:
-        raise ValueError(
+        raise InputError(
             f"{table.location} has both `distribution` and `at`: one of them is enough."
         )
     if "at" in table.entries:

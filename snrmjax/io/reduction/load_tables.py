@@ -51,7 +51,7 @@ from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, POSITIVE
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, POSITIVE, InputError
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
 _NUMBERED = re.compile(r"([a-z]+)_([1-9][0-9]{0,5})")
@@ -75,21 +75,21 @@ def read_load_tables(folder: FilePath) -> ReductionSource:
     folder_path = Path(folder)
     if not folder_path.is_dir():
         what = "is a file, but a folder is expected" if folder_path.exists() else "does not exist"
-        raise ValueError(f"{os.fspath(folder)} {what}.")
+        raise InputError(f"{os.fspath(folder)} {what}.")
     top = parsed_toml(read_text(folder_path / "modes.toml"), "modes.toml")
     top.check_keys(("frequency_hz",), _KEYS)
     frequency = np.array(top.numbers("frequency_hz", POSITIVE, IN_RANGE_HZ, each="mode")) * HERTZ
     n = frequency.size
     if not n:
-        raise ValueError("`frequency_hz` of modes.toml must have at least one mode, but is empty.")
+        raise InputError("`frequency_hz` of modes.toml must have at least one mode, but is empty.")
     shapes, mass = (
         _matrix(top, folder_path, "shapes", "shape"),
         _matrix(top, folder_path, "mass", "mass"),
     )
     if mass is not None and shapes is None:
-        raise ValueError("modes.toml has a `mass`, but no `shapes`.")
+        raise InputError("modes.toml has a `mass`, but no `shapes`.")
     if shapes is not None and shapes.values.shape[1] != n:
-        raise ValueError(
+        raise InputError(
             f"{shapes.file} has {shapes.values.shape[1]} shapes for the {n} modes of modes.toml."
         )
     stated = "numbers" in top.entries
@@ -122,22 +122,22 @@ def _read_cases(path: Path, basis: ReductionBasis, shapes: _Matrix | None) -> St
     for needed in (("f",), ("q", "u")):
         if not any(stem in table.groups for stem in needed):
             named = " or ".join(f"`{stem}_1 …`" for stem in needed)
-            raise ValueError(f"{path.name} has no {named}.")
+            raise InputError(f"{path.name} has no {named}.")
     for stem in ("f", "q"):
         if table.groups.get(stem, n) != n:
-            raise ValueError(
+            raise InputError(
                 f"{path.name} has {table.groups[stem]} modes in `{stem}_1 …`, but modes.toml {n}."
             )
     names = tuple(table.cells.texts("case")) if table.cells.has("case") else ()
     for k, name in enumerate(names):
         if name in names[:k]:
-            raise ValueError(f"{path.name} has the case {name!r} twice.")
+            raise InputError(f"{path.name} has the case {name!r} twice.")
     displacement = table.group("u", empty_allowed=True) if "u" in table.groups else None
     if displacement is not None:
         if shapes is None:
-            raise ValueError(f"{path.name} has `u_1 …` of nodes, but modes.toml has no `shapes`.")
+            raise InputError(f"{path.name} has `u_1 …` of nodes, but modes.toml has no `shapes`.")
         if displacement.shape[1] != len(shapes.values):
-            raise ValueError(
+            raise InputError(
                 f"{path.name} has {displacement.shape[1]} degrees of freedom in `u_1 …`, but "
                 f"{shapes.file} has {len(shapes.values)} rows."
             )
@@ -171,7 +171,7 @@ def _matrix(top: TomlTable, folder_path: Path, key: str, stem: str) -> _Matrix |
     if key == "mass" and table.cells.has("mass"):
         return _Matrix(table.cells.numbers("mass"), file)
     if stem not in table.groups:
-        raise ValueError(f"{file} lacks the column `{stem}_1`.")
+        raise InputError(f"{file} lacks the column `{stem}_1`.")
     return _Matrix(table.group(stem), file)
 
 
@@ -187,10 +187,10 @@ def _basis(
     shapes, file = given
     n_dof = len(shapes)
     if n_dof < n:
-        raise ValueError(f"{file} has {n_dof} rows, fewer than the {n} modes.")
+        raise InputError(f"{file} has {n_dof} rows, fewer than the {n} modes.")
     if mass is not None:
         if mass.values.shape not in ((n_dof,), (n_dof, n_dof)):
-            raise ValueError(
+            raise InputError(
                 f"{mass.file} has the shape {mass.values.shape}, but {file} has {n_dof} rows."
             )
         diagonal = mass.values.ndim == 1
@@ -199,7 +199,7 @@ def _basis(
         return _reduction_basis(frequency, shapes, product.T, numbers)
     values = np.linalg.svd(shapes / np.linalg.norm(shapes, axis=0), compute_uv=False)
     if not values[-1] > 1e-6 * values[0]:
-        raise ValueError(f"the shapes of {file} are not linearly independent.")
+        raise InputError(f"the shapes of {file} are not linearly independent.")
     return _reduction_basis(frequency, shapes, np.linalg.pinv(shapes), numbers)
 
 
@@ -218,7 +218,7 @@ def _check_identity(product: np.ndarray, numbers: tuple[int, ...], files: str) -
     which = (
         f"mode {numbers[row]}" if row == column else f"modes {numbers[row]} and {numbers[column]}"
     )
-    raise ValueError(
+    raise InputError(
         f"the shapes are {what}: ΦᵀMΦ of {which} is {product[row, column]:.4g} where "
         f"{float(row == column):g} is expected ({files})."
     )
@@ -232,7 +232,7 @@ def _sensors(
         named = {name: table.numbers(name, each="mode", count=n) for name in table.entries}
         return {name: np.array(shape) for name, shape in named.items()}, []
     if shapes is None:
-        raise ValueError("modes.toml has neither [sensors] nor `shapes`: state one of them.")
+        raise InputError("modes.toml has neither [sensors] nor `shapes`: state one of them.")
     row = int(np.argmax(np.abs(shapes[:, 0])))
     name = f"dof {row + 1}"
     return {name: shapes[row]}, [Fact("sensor_assumed", name=name)]
@@ -267,11 +267,11 @@ def _read_table(path: FilePath, stems: tuple[str, ...], single: tuple[str, ...] 
         elif name not in single:
             known = (*single, *(f"{stem}_1" for stem in stems))
             near = suggestion(name, known)
-            raise ValueError(f"{cells.file} has the unknown column {shown(name)}{near}.")
+            raise InputError(f"{cells.file} has the unknown column {shown(name)}{near}.")
     for stem, count in groups.items():
         for k in range(count):
             if not cells.has(f"{stem}_{k + 1}"):
-                raise ValueError(f"{cells.file} lacks the column `{stem}_{k + 1}`.")
+                raise InputError(f"{cells.file} lacks the column `{stem}_{k + 1}`.")
     cells.require_rows()
     return _Table(cells, groups)
 

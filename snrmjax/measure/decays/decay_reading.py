@@ -17,6 +17,7 @@ from snrmjax.measure.decays.local_fit import (
 )
 from snrmjax.measure.decays.mode_ridge import FRAME_CYCLES, Ridge
 from snrmjax.measure.decays.slow_flow import SlowFlow, slow_flow
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 PER_CYCLE = 2  # readings per cycle
@@ -98,7 +99,7 @@ def _read_from(
         carrier, rate = Carrier(at, local.level), local.rate
     backwards = np.flatnonzero(rate.imag <= 0)
     if backwards.size:
-        raise ValueError(
+        raise InputError(
             f"the mode cannot be isolated: at {at[backwards[0]]:.4g} s its phase runs backwards, "
             "as in a beat with another motion of similar amplitude."
         )

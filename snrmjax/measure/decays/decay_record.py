@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.numerics.rules import InputError
+
 FEWEST_SAMPLES = 8  # per cycle: a parabola through an extremum is then within 2 % of a cosine
 _FEWEST_CYCLES = 12
 _FEWEST_FALLING = 5  # cycles, for a decay to a quarter
@@ -17,21 +19,21 @@ def even_record(
     """Check a record: finite, evenly spaced and not clipped; raises `ValueError` otherwise."""
     times, signal = np.asarray(time, dtype=float), np.asarray(velocity, dtype=float)
     if times.ndim != 1 or times.shape != signal.shape or len(times) < FEWEST_SAMPLES:
-        raise ValueError(
+        raise InputError(
             f"`time` and `velocity` must have the same length, but have shapes {times.shape} and "
             f"{signal.shape}."
         )
     if not (np.isfinite(times).all() and np.isfinite(signal).all()):
-        raise ValueError("the record must be of finite numbers, but has NaN or inf.")
+        raise InputError("the record must be of finite numbers, but has NaN or inf.")
     steps = np.diff(times)
     if steps.min() <= 0 or np.ptp(steps) > _EVEN * steps.mean():
-        raise ValueError("times must be ascending and evenly spaced, but are not.")
+        raise InputError("times must be ascending and evenly spaced, but are not.")
     largest = np.abs(signal).max()
     flat = np.abs(signal) >= largest * (1 - 1e-9)
     ends = np.flatnonzero(np.diff(np.concatenate([[0], flat, [0]])))
     run = int(np.max(ends[1::2] - ends[::2]))
     if largest > 0 and run >= _CLIPPED + _at_an_extreme(signal, largest):
-        raise ValueError(
+        raise InputError(
             f"the record stays at its largest value, {largest:.4g}, for {run} samples: it is "
             "clipped."
         )
@@ -51,7 +53,7 @@ def require_cycles(signal: Float[np.ndarray, " sample"], cycles: float) -> None:
     part = max(1, int(len(signal) / max(cycles, 1.0)))
     first, last = np.abs(signal[:part]).max(), np.abs(signal[-part:]).max()
     if not enough_cycles(cycles, np.log(max(first, 1e-300) / max(last, 1e-300))):
-        raise ValueError(
+        raise InputError(
             f"{_FEWEST_CYCLES} cycles are needed, or {_FEWEST_FALLING} in which the motion decays "
             f"to a quarter, but the record has {cycles:.3g}."
         )
@@ -65,7 +67,7 @@ def enough_cycles(cycles: float, fall: float) -> bool:
 def require_samples(samples: float, why: str = "") -> None:
     """Raise `ValueError` for fewer than eight samples per cycle."""
     if samples < FEWEST_SAMPLES:
-        raise ValueError(
+        raise InputError(
             f"{FEWEST_SAMPLES} samples a cycle are needed, but the record has {samples:.1f}: the "
             f"sampling rate is too low{why}."
         )

@@ -37,6 +37,7 @@ from snrmjax.measure.decays.local_fit import ROUNDS, Carrier, local_fit
 from snrmjax.measure.decays.mains_hum import mains_hum
 from snrmjax.measure.decays.mode_ridge import ridge_of_mode, spectral_peaks
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 MAX_INTERFERING = 0.01  # largest fraction of the energy inside the band from other motion
@@ -120,7 +121,7 @@ def isolate_decay(
     require_samples(HERTZ / (frequency * step))
     ridge = ridge_of_mode(spectral_peaks(times, values, frequency), frequency)
     if ridge is None:
-        raise ValueError(
+        raise InputError(
             f"no decaying mode stands out of the noise near {frequency / HERTZ:.4g} Hz."
         )
     require_samples(HERTZ / (float(ridge.frequency.max()) * step))
@@ -148,7 +149,7 @@ def _usable(reading: DecayReading) -> slice:
         float(np.ptp(level.imag)) / HERTZ + 0.5, float(level[0].real - level[-1].real)
     ):
         return longest
-    raise ValueError(_refusal(reading, slice(None)))
+    raise InputError(_refusal(reading, slice(None)))
 
 
 def _refusal(reading: DecayReading, part: slice) -> str:
@@ -212,7 +213,7 @@ def _isolated(
     ]
     beyond = noise[0] * np.sqrt(np.maximum(excess[0] ** 2 - 1, 0.0))
     if np.median(np.abs(beyond / reading.smooth.rate.real[rows])) > UNDETERMINED:
-        raise ValueError(_refusal(reading, part))
+        raise InputError(_refusal(reading, part))
     inside = slice(*np.searchsorted(time, reading.carrier.time[[kept.start, kept.stop - 1]]))
     return IsolatedDecay(
         time[inside],

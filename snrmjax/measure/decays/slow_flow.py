@@ -14,6 +14,8 @@ from jaxtyping import Complex, Float
 from numpy.polynomial import chebyshev
 from scipy.interpolate import CubicSpline
 
+from snrmjax.numerics.rules import InputError
+
 _FEWEST, _MOST = 3, 9  # number of functions of the amplitude: the first is 1/A
 _ROUNDS = 5
 _LEAST = 0.02  # of the largest amplitude, below which 1/A is constant
@@ -49,7 +51,7 @@ def slow_flow(
         if score < least:
             best, least = flow, score
     if best is None:
-        raise ValueError("the decay is too short for a smooth curve.")
+        raise InputError("the decay is too short for a smooth curve.")
     return best
 
 

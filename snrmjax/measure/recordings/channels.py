@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
-from snrmjax.numerics.rules import NOT_ZERO, require
+from snrmjax.numerics.rules import NOT_ZERO, InputError, require
 
 Quantity = Literal["force", "displacement", "velocity", "acceleration", "voltage", "unknown"]
 
@@ -56,13 +56,13 @@ def checked_channels(channels: Sequence[Channel]) -> tuple[Channel, ...]:
     """
     listed = tuple(channels)
     if not listed:
-        raise ValueError("a recording needs at least one channel.")
+        raise InputError("a recording needs at least one channel.")
     names = [channel.name for channel in listed]
     for channel in listed:
         if not channel.name or names.count(channel.name) > 1:
-            raise ValueError(f"channels need distinct names, but are {', '.join(names)}.")
+            raise InputError(f"channels need distinct names, but are {', '.join(names)}.")
         if channel.quantity not in get_args(Quantity):
-            raise ValueError(
+            raise InputError(
                 f"the quantity of channel {channel.name} must be one of {', '.join(SI_UNIT)}, but "
                 f"is {channel.quantity!r}."
             )
@@ -74,5 +74,5 @@ def channel_number(channels: Sequence[Channel], name: str) -> int:
     """Index of a channel by name. Raises `ValueError` that lists the existing names."""
     names = [channel.name for channel in channels]
     if name not in names:
-        raise ValueError(f"there is no channel {name!r}; there are {', '.join(names)}.")
+        raise InputError(f"there is no channel {name!r}; there are {', '.join(names)}.")
     return names.index(name)

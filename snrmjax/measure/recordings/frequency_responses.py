@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 from snrmjax.measure.recordings.channels import DERIVATIVE, Channel, checked_channels
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 
@@ -45,7 +46,7 @@ class FrequencyResponses(AbstractResult):
         receptances = []
         for channel, row in zip(self.responses, self.values, strict=True):
             if channel.quantity not in DERIVATIVE:
-                raise ValueError(
+                raise InputError(
                     f"channel {channel.name} must be a displacement, velocity or acceleration, but "
                     f"is {channel.quantity}."
                 )
@@ -101,7 +102,7 @@ def frequency_responses(
     outputs, inputs = checked_channels(responses), checked_channels(references)
     wanted = (len(outputs), len(inputs), omega.size)
     if omega.ndim != 1 or numbers.shape != wanted:
-        raise ValueError(
+        raise InputError(
             f"`values` must have shape {wanted} (responses, references, frequencies), but has "
             f"{numbers.shape}."
         )
@@ -111,12 +112,12 @@ def frequency_responses(
         or omega[0] < 0
         or np.any(np.diff(omega) <= 0)
     ):
-        raise ValueError("`frequency` must be finite and ascending from zero or above.")
+        raise InputError("`frequency` must be finite and ascending from zero or above.")
     if np.isinf(numbers).any() or np.isnan(numbers).all():
-        raise ValueError("`values` must be finite where they were measured, and not all missing.")
+        raise InputError("`values` must be finite where they were measured, and not all missing.")
     known = np.full(wanted, np.nan) if coherence is None else np.asarray(coherence, dtype=float)
     if known.shape != wanted:
-        raise ValueError(f"`coherence` must have shape {wanted}, but has {known.shape}.")
+        raise InputError(f"`coherence` must have shape {wanted}, but has {known.shape}.")
     scale = np.array([channel.calibration for channel in outputs])[:, None] / np.array(
         [channel.calibration for channel in inputs]
     )

@@ -17,6 +17,7 @@ from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 _EXCITED = 0.03  # of the largest line of the force, least amplitude of an excited line
@@ -147,19 +148,19 @@ class _Spectra(NamedTuple):
 
 def _check(records: tuple[TimeRecording, ...], names: tuple[str, ...], skip: int) -> None:
     if not records:
-        raise ValueError("`recordings` must have at least one realisation, but is empty.")
+        raise InputError("`recordings` must have at least one realisation, but is empty.")
     if len(names) < 2 or len(set(names)) != len(names):
-        raise ValueError(f"name a force and other channels as responses, not {', '.join(names)}.")
+        raise InputError(f"name a force and other channels as responses, not {', '.join(names)}.")
     for record in records:
         for name in names:
             channel_number(record.channels, name)
         if record.sampling_rate != records[0].sampling_rate:
-            raise ValueError(
+            raise InputError(
                 "realisations must have one sampling rate, but have "
                 f"{records[0].sampling_rate:g} and {record.sampling_rate:g} Hz."
             )
     if skip < 0 or int(skip) != skip:
-        raise ValueError(f"`skip` must be a whole number of periods from 0 on, but is {skip}.")
+        raise InputError(f"`skip` must be a whole number of periods from 0 on, but is {skip}.")
 
 
 def _in_si(recording: TimeRecording, name: str) -> Channel:
@@ -171,7 +172,7 @@ def _in_si(recording: TimeRecording, name: str) -> Channel:
 def _stated(period: float, rate: float) -> int:
     samples = round(period * rate) if np.isfinite(period) else 0
     if samples < 4 or abs(period * rate - samples) > 1e-3:
-        raise ValueError(
+        raise InputError(
             f"`period` must be a whole number of samples (4 or more), but {period:g} s are "
             f"{period * rate:g}."
         )
@@ -181,7 +182,7 @@ def _stated(period: float, rate: float) -> int:
 def _detected_period(recording: TimeRecording, force: str) -> int:
     values = recording.values([force], 0, _MOST_SAMPLES)[0]
     if not np.isfinite(values).all():
-        raise ValueError(f"channel {force} has samples that are not finite.")
+        raise InputError(f"channel {force} has samples that are not finite.")
     values = values - values.mean()
     n = len(values)
     spectrum = np.abs(np.fft.rfft(values, 2 * n)) ** 2
@@ -193,7 +194,7 @@ def _detected_period(recording: TimeRecording, force: str) -> int:
     after = int(falls[0]) if falls.size else n // 2
     best = correlation[after:].max(initial=0.0)
     if best < _REPEATS:
-        raise ValueError(
+        raise InputError(
             f"no period in channel {force}: it does not repeat within half the record; state "
             "`period`."
         )
@@ -202,12 +203,12 @@ def _detected_period(recording: TimeRecording, force: str) -> int:
         (late[1:-1] >= late[:-2]) & (late[1:-1] >= late[2:]) & (late[1:-1] >= _BEST * best)
     )
     if not inner.size:
-        raise ValueError(f"no period in channel {force}; state `period`.")
+        raise InputError(f"no period in channel {force}; state `period`.")
     lag = after + 1 + int(inner[0])
     a, b, c = correlation[lag - 1 : lag + 2]
     off = 0.5 * (a - c) / (a - 2 * b + c)
     if abs(off) > _OFF:
-        raise ValueError(
+        raise InputError(
             f"the period of channel {force}, about {lag + off:.2f} samples, is not a whole "
             "number: sample in step with the generator, or state `period`."
         )
@@ -217,7 +218,7 @@ def _detected_period(recording: TimeRecording, force: str) -> int:
 def _spectra(recording: TimeRecording, names: tuple[str, ...], samples: int, skip: int) -> _Spectra:
     count = recording.n_samples // samples - skip
     if count < 2:
-        raise ValueError(
+        raise InputError(
             f"two periods are needed after the {skip} discarded, but the record has "
             f"{recording.n_samples / samples:.3g} of {samples / recording.sampling_rate:.4g} s."
         )
@@ -228,7 +229,7 @@ def _spectra(recording: TimeRecording, names: tuple[str, ...], samples: int, ski
     for k in range(skip, skip + count):
         values = recording.values(names, k * samples, (k + 1) * samples)
         if not np.isfinite(values).all():
-            raise ValueError(f"period {k} of the record has samples that are not finite.")
+            raise InputError(f"period {k} of the record has samples that are not finite.")
         spectrum = 2 / samples * np.fft.rfft(values, axis=1)
         first = spectrum if k == skip else first
         away = spectrum - first  # relative to the first: no cancellation in the squares
@@ -256,9 +257,9 @@ def _lines(
         position = np.asarray(lines, dtype=float) * samples / rate / HERTZ
         number = np.unique(np.round(position).astype(int))
         if not position.size or np.any(np.abs(position - np.round(position)) > 1e-3):
-            raise ValueError("`lines` must be multiples of 1/period (in rad/s: times 2π).")
+            raise InputError("`lines` must be multiples of 1/period (in rad/s: times 2π).")
         if number[0] < 1 or number[-1] >= highest:
-            raise ValueError("`lines` must lie between 0 and half the sampling rate.")
+            raise InputError("`lines` must lie between 0 and half the sampling rate.")
         return number
     amplitude = np.abs(spectra.mean[0])
     amplitude[0] = 0.0
@@ -267,7 +268,7 @@ def _lines(
         (amplitude > _EXCITED * amplitude.max()) & (amplitude**2 > _SURE * noise)
     )
     if not excited.size or amplitude.max() == 0:
-        raise ValueError("no line of the force exceeds its noise: nothing is excited.")
+        raise InputError("no line of the force exceeds its noise: nothing is excited.")
     return excited
 
 

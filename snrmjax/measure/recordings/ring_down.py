@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.numerics.rules import BETWEEN_ZERO_AND_ONE, require
+from snrmjax.numerics.rules import BETWEEN_ZERO_AND_ONE, InputError, require
 
 _BLOCK = 2**18  # samples per block
 _FRAME = 2  # cycles of the response per value of the drive's envelope
@@ -58,7 +58,7 @@ def find_ring_downs(
         for rows, level in _stops(envelope, quiet, max(1, round(_FEWEST_CYCLES / _FRAME)))
     ]
     if not decays:
-        raise ValueError(
+        raise InputError(
             f"channel {drive} never stops for {_FEWEST_CYCLES} cycles: it does not fall to "
             f"{100 * quiet:g} % of its level (noise above that? state a larger `quiet`)."
         )
@@ -76,7 +76,7 @@ def _strongest(recording: TimeRecording, name: str) -> float:
             spectrum[:2] = 0.0
             loudest, frequency = power, 2 * np.pi * float(np.argmax(spectrum)) / len(values)
     if frequency == 0:
-        raise ValueError(f"channel {name} does not move: there is no free decay.")
+        raise InputError(f"channel {name} does not move: there is no free decay.")
     return frequency
 
 

@@ -29,6 +29,7 @@ from snrmjax.measure.signals import require_fundamental
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
 
@@ -178,7 +179,7 @@ def _recognised(
     recording: TimeRecording, chosen: ChosenChannels, amplitude_step: float, frequency_step: float
 ) -> list[Step]:
     if not 0 < amplitude_step < 1 or not frequency_step >= 0:
-        raise ValueError(
+        raise InputError(
             "`least_amplitude_step` must be between 0 and 1 and `least_frequency_step` not below "
             f"0, but they are {amplitude_step:g} and {frequency_step:g}."
         )
@@ -192,19 +193,19 @@ def _recognised(
     )
     long = [step for step in steps if _cycles(recording, step) >= _FEWEST_CYCLES]
     if sum(step.stop - step.start for step in long) < _COVERED * np.ptp(track.middle):
-        raise ValueError(
+        raise InputError(
             f"the record has no steps: the tone of channel {name} does not dwell at one frequency "
             f"for {_FEWEST_CYCLES} cycles anywhere (a sweep? `sweep_states` reads it)."
         )
     if len(long) == 1:
-        raise ValueError(
+        raise InputError(
             f"the record has one step only, of {long[0].frequency / HERTZ:.6g} Hz from "
             f"{long[0].start / recording.sampling_rate:.4g} s on: state `frequencies` where a "
             "single tone is meant."
         )
     moves = moves_within_steps(long, track, recording.sampling_rate)
     if moves > _MOVES:
-        raise ValueError(
+        raise InputError(
             f"the record has no steps: the frequency of channel {name} drifts within them, by "
             f"{100 * moves:.0f} % of the way to the next (a sweep? `sweep_states` reads it)."
         )
@@ -216,7 +217,7 @@ def _of_table(
 ) -> list[Step]:
     table = np.asarray(frequencies, dtype=float)
     if table.ndim != 2 or table.shape[1:] != (3,) or not len(table):
-        raise ValueError(
+        raise InputError(
             "`frequencies` must have rows of start (s), end (s) and frequency (rad/s), but has "
             f"shape {table.shape}."
         )
@@ -225,12 +226,12 @@ def _of_table(
     steps = []
     for k, (start, stop, omega) in enumerate(table):
         if not (np.isfinite([start, stop, omega]).all() and start < stop and omega > 0):
-            raise ValueError(
+            raise InputError(
                 f"row {k} of `frequencies` must have start < end and a frequency above 0, "
                 f"but is {start:g} s, {stop:g} s, {omega:g} rad/s."
             )
         if start < begin - slack or stop > end + slack:
-            raise ValueError(
+            raise InputError(
                 f"row {k} of `frequencies` lies beyond the record: {start:g} to {stop:g} s, but "
                 f"the record goes from {begin:g} to {end:g} s."
             )
@@ -245,7 +246,7 @@ def _check_highest(
 ) -> None:
     highest = max(step.frequency for step in steps) * max(orders)
     if highest >= np.pi * recording.sampling_rate:
-        raise ValueError(
+        raise InputError(
             f"harmonic {max(orders)} of {highest / max(orders) / HERTZ:.6g} Hz lies above half "
             f"the sampling rate, {recording.sampling_rate / 2:.6g} Hz: ask for fewer harmonics."
         )
@@ -266,7 +267,7 @@ def _measure(
 ) -> _Measured:
     """Evaluate one step."""
     if settle is not None and not 0 <= settle < np.inf:
-        raise ValueError(f"`settle` must be a time of 0 s or more, but is {settle:g}.")
+        raise InputError(f"`settle` must be a time of 0 s or more, but is {settle:g}.")
     if _cycles(recording, step) < _FEWEST_CYCLES:
         return _Measured(step, StepStatus.TOO_SHORT)
     below = np.pi * recording.sampling_rate / step.frequency
@@ -363,7 +364,7 @@ def _result(
         )
         moving = np.isin(status, (int(StepStatus.UNSETTLED), int(StepStatus.TOO_SHORT))).all()
         hint = " (a sweep? `sweep_states` reads it)" if moving else ""
-        raise ValueError(
+        raise InputError(
             f"none of the {len(measured)} steps of the record settled: {reasons}{hint}."
         )
     states = states_of_phasors(recording, chosen, _table(good), orders, level)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Num
 from snrmjax.measure.recordings.channels import Channel, channel_number, checked_channels
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, setting
-from snrmjax.numerics.rules import POSITIVE, require
+from snrmjax.numerics.rules import POSITIVE, InputError, require
 
 _MOST_AT_ONCE = 2**25  # numbers of all channels together: 256 MiB of float64
 
@@ -105,7 +105,7 @@ class TimeRecording(AbstractResult):
         rows = [channel_number(self.channels, name) for name in chosen]
         last = self.n_samples if stop is None else min(stop, self.n_samples)
         if len(rows) * max(0, last - start) > _MOST_AT_ONCE:
-            raise ValueError(
+            raise InputError(
                 f"{len(rows)} channels of {last - start} samples are too many for memory: "
                 "read them by blocks."
             )
@@ -120,7 +120,7 @@ class TimeRecording(AbstractResult):
         The last may be shorter. Raises `ValueError` for an overlap that is not below `length`.
         """
         if not 0 <= overlap < length:
-            raise ValueError(f"`overlap` must be from 0 to below {length}, but is {overlap}.")
+            raise InputError(f"`overlap` must be from 0 to below {length}, but is {overlap}.")
         start = 0
         while start < self.n_samples:
             stop = min(start + length, self.n_samples)
@@ -170,11 +170,11 @@ def time_recording(
     stored = samples if isinstance(samples, AbstractSamples) else _in_memory(samples)
     listed = checked_channels(channels)
     if stored.shape[0] != len(listed):
-        raise ValueError(
+        raise InputError(
             f"`samples` must have one row per channel, {len(listed)}, but has {stored.shape[0]}."
         )
     if not stored.shape[1]:
-        raise ValueError("a recording needs samples, but has none.")
+        raise InputError("a recording needs samples, but has none.")
     require("`sampling_rate` (Hz)", sampling_rate, POSITIVE)
     require("`start_time` (s)", start_time)
     return TimeRecording(
@@ -185,7 +185,7 @@ def time_recording(
 def _in_memory(samples: Num[np.ndarray, "channel sample"]) -> SamplesInMemory:
     values = np.asanyarray(samples)
     if values.ndim != 2 or values.dtype.kind not in "iuf":
-        raise ValueError(
+        raise InputError(
             "`samples` must be real numbers of channels by samples, but have shape "
             f"{values.shape} and type {values.dtype}."
         )

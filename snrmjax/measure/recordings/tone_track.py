@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 _BLOCK = 2**18  # samples per block
@@ -46,7 +47,7 @@ def track_tone(recording: TimeRecording, name: str) -> ToneTrack:
     pieces = list(_blocks(recording, name))
     columns = [np.concatenate(part) for part in zip(*pieces, strict=True)]
     if not columns[0].size:
-        raise ValueError(
+        raise InputError(
             f"channel {name} has no tone: in no stretch of {_CYCLES[0]} to {_CYCLES[1]} cycles has "
             f"one frequency half of the power, with {_FEWEST_SAMPLES} samples per cycle or more."
         )
@@ -64,7 +65,7 @@ def check_rate(recording: TimeRecording, frequency: float, name: str) -> None:
     """Raises `ValueError` for a frequency (rad/s) with fewer than four samples per cycle."""
     samples = 2 * np.pi * recording.sampling_rate / frequency
     if samples < _FEWEST_SAMPLES * (1 - 1e-9):
-        raise ValueError(
+        raise InputError(
             f"a record needs {_FEWEST_SAMPLES} samples per cycle, but channel {name} has "
             f"{samples:.3g} at {frequency / HERTZ:.6g} Hz, sampled at "
             f"{recording.sampling_rate:.6g} Hz."

@@ -12,6 +12,7 @@ from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 Levels = Literal["auto", "force", "drive", "runs"]
 
@@ -62,32 +63,32 @@ def choose_channels(
     """
     wanted = (responses,) if isinstance(responses, str) else tuple(responses)
     if not wanted:
-        raise ValueError("`responses` must name at least one channel, but is empty.")
+        raise InputError("`responses` must name at least one channel, but is empty.")
     source = recording.channels[_number(recording, force, "force")]
     if is_base and source.quantity not in DERIVATIVE:
-        raise ValueError(
+        raise InputError(
             f"channel {force} must be the motion of a base, but its quantity is {source.quantity}."
         )
     if not is_base and source.quantity not in ("force", "voltage"):
-        raise ValueError(
+        raise InputError(
             f"channel {force} must be a force or the voltage that drives one, but its quantity is "
             f"{source.quantity}."
         )
     motions = tuple(recording.channels[_number(recording, name, "response")] for name in wanted)
     for channel in motions:
         if channel.quantity not in DERIVATIVE:
-            raise ValueError(
+            raise InputError(
                 f"channel {channel.name} must be a displacement, velocity or acceleration, but its "
                 f"quantity is {channel.quantity}."
             )
     names = (force, *wanted)
     if len(set(names)) != len(names):
-        raise ValueError(f"each channel can be named once, but got {', '.join(names)}.")
+        raise InputError(f"each channel can be named once, but got {', '.join(names)}.")
     if drive is not None:
         _number(recording, drive, "drive")
     labels = wanted if sensors is None else tuple(sensors)
     if len(labels) != len(wanted) or len(set(labels)) != len(labels):
-        raise ValueError(
+        raise InputError(
             f"`sensors` must name each of the {len(wanted)} responses once, but is "
             f"{', '.join(labels) or 'empty'}."
         )
@@ -174,12 +175,12 @@ def number_levels(
     """
     if not isinstance(level, str):
         if isinstance(level, bool) or int(level) != level:
-            raise ValueError(f"`level` must be a whole number or a word, but is {level!r}.")
+            raise InputError(f"`level` must be a whole number or a word, but is {level!r}.")
         return np.full(len(frequency), int(level)), ""
     if level not in get_args(Levels):
-        raise ValueError(f"`level` must be one of {get_args(Levels)} or a number, not {level!r}.")
+        raise InputError(f"`level` must be one of {get_args(Levels)} or a number, not {level!r}.")
     if level == "drive" and drive is None:
-        raise ValueError("`level='drive'` needs the channel of the drive: state `drive`.")
+        raise InputError("`level='drive'` needs the channel of the drive: state `drive`.")
     if level == "drive" or (level == "auto" and drive is not None):
         return _groups(drive)[0], "drive"
     groups, spread = _groups(force)
@@ -191,8 +192,8 @@ def number_levels(
 def _number(recording: TimeRecording, name: str, what: str) -> int:
     try:
         return channel_number(recording.channels, name)
-    except ValueError as error:
-        raise ValueError(f"the {what} channel is missing: {error}") from error
+    except InputError as error:
+        raise InputError(f"the {what} channel is missing: {error}") from error
 
 
 def _groups(amplitude: Float[np.ndarray, " state"] | None) -> tuple[np.ndarray, float]:

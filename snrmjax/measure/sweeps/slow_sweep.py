@@ -36,7 +36,7 @@ from snrmjax.measure.sweeps.swept_table import (
 )
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
-from snrmjax.numerics.rules import POSITIVE, require
+from snrmjax.numerics.rules import POSITIVE, InputError, require
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
 
@@ -133,13 +133,13 @@ def sweep_states(
         recording, force, responses, sensors=sensors, drive=drive, is_base=is_base
     )
     if not cycles >= 6:
-        raise ValueError(f"`cycles` must be 6 at least, but is {cycles:g}.")
+        raise InputError(f"`cycles` must be 6 at least, but is {cycles:g}.")
     guide = drive or force
     track = track_tone(recording, guide)
     phase = unwrapped_phase(track)
     runs = sweep_runs(track, phase)
     if not runs:
-        raise ValueError(
+        raise InputError(
             f"the record has no sweep: the frequency of channel {guide} does not change by "
             f"{100 * LEAST_RANGE:g} % in one direction (steps? `stepped_sine_states` reads them)."
         )
@@ -217,14 +217,14 @@ def _wanted(
 ) -> Float[np.ndarray, " frequency"]:
     wanted = np.asarray(frequencies, dtype=float)
     if wanted.ndim != 1 or not wanted.size:
-        raise ValueError("`frequencies` must be a vector of at least one frequency.")
+        raise InputError("`frequencies` must be a vector of at least one frequency.")
     require("`frequencies` (rad/s)", wanted, POSITIVE)
     speed = track_speed(reader.track, reader.phase) * reader.recording.sampling_rate
     low = min(float(speed[rows].min()) for rows in runs)
     high = max(float(speed[rows].max()) for rows in runs)
     outside = wanted[(wanted < low) | (wanted > high)]
     if outside.size:
-        raise ValueError(
+        raise InputError(
             f"`frequencies` must lie within the sweeps, {low / HERTZ:.6g} to "
             f"{high / HERTZ:.6g} Hz, but one is {outside[0] / HERTZ:.6g} Hz."
         )
@@ -258,7 +258,7 @@ def _result(
             if count and kind is not SweepStatus.FOUND
         )
         default = "none passes the wanted frequencies, or samples are missing there"
-        raise ValueError(f"the sweeps give no steady state: {reasons or default}.")
+        raise InputError(f"the sweeps give no steady state: {reasons or default}.")
     kept = [moment for moment, good in zip(moments, slow, strict=True) if good]
     table = table_of(kept, reader.chosen, force[slow], force_std[slow])
     number = np.array([moment.sweep for moment in kept])

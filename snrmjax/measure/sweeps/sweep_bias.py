@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.numerics.rules import BETWEEN_ZERO_AND_ONE, POSITIVE, require
+from snrmjax.numerics.rules import BETWEEN_ZERO_AND_ONE, POSITIVE, InputError, require
 
 _REACH = 12.0  # half bandwidths about resonance, the range searched for the peak
 _POINTS = 4001
@@ -48,7 +48,7 @@ def sweep_bias(natural_frequency: float, damping_ratio: float, rate: float) -> S
     curvature = abs(rate) / half**2
     normalised = np.pi / 2 * curvature
     if normalised > _FASTEST:
-        raise ValueError(
+        raise InputError(
             f"the sweep of {rate:g} rad/s² is too fast for a resonance peak: its normalised rate "
             f"is {normalised:.3g}, more than {_FASTEST:g}."
         )

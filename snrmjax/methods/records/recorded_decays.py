@@ -19,6 +19,7 @@ from snrmjax.methods.records.ssm import curves_of_submanifold, fit_submanifold
 from snrmjax.methods.result import MethodResult
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 
@@ -32,7 +33,7 @@ def recorded_decays(test: RecordedTest, modes: LinearModes) -> tuple[RecordedDec
         try:
             motion = recorded_velocity(test.recording, test.channels.reference, rest, part)
             decay = isolate_decay(motion.time, motion.velocity, rest)
-        except ValueError as error:
+        except InputError as error:
             # For a single decay this is the reason why no decay method ran.
             why = (Fact("decay_left_out", why=str(error)),) if len(test.free) > 1 else ()
             decays.append(RecordedDecay(None, why, str(error)))
@@ -57,7 +58,7 @@ def read_decays(
         _require_mode(result, one.decay)
         results.append(result)
     if not results:
-        raise ValueError(decays[0].why if decays else "the record has no free decay.")
+        raise InputError(decays[0].why if decays else "the record has no free decay.")
     return results
 
 
@@ -132,7 +133,7 @@ def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
     omega = np.asarray(result.natural_frequency)[result.found]
     low, high = decay.band
     if omega.size and (omega.min() < low or omega.max() > high):
-        raise ValueError(
+        raise InputError(
             f"the natural frequency, {omega.min() / HERTZ:.4g} to {omega.max() / HERTZ:.4g} Hz, "
             f"is outside the mode's band of {low / HERTZ:.4g} to {high / HERTZ:.4g} Hz: the "
             "method follows another motion."
@@ -141,7 +142,7 @@ def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
         np.asarray(one)[result.found] for one in (result.damping_ratio, result.damping_ratio_std)
     )
     if ratio.size and np.nanmedian(std / ratio) > UNDETERMINED:
-        raise ValueError(
+        raise InputError(
             f"the 1σ of the damping is {100 * np.nanmedian(std / ratio):.2g} % of the damping "
             "(median): the method does not determine the damping."
         )

@@ -26,6 +26,7 @@ from snrmjax.measure.recordings.tone_track import ToneTrack, track_tone, unwrapp
 from snrmjax.measure.sweeps.sweep_runs import sweep_runs
 from snrmjax.model.modes import LinearModes, reference_sensor
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _MOTIONS = ("velocity", "acceleration", "displacement")
 _HERTZ = 2 * np.pi
@@ -98,11 +99,11 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     rest = modes.natural_frequency.item(modes.mode_of_interest)
     motion = recording.values([channels.reference], 0, _MOST_SAMPLES)[0]
     if not np.isfinite(motion).all():
-        raise ValueError(
+        raise InputError(
             f"{recording.name}: channel {channels.reference} has samples that are not finite."
         )
     if not np.ptp(motion) > 0:
-        raise ValueError(f"{recording.name}: channel {channels.reference} does not move.")
+        raise InputError(f"{recording.name}: channel {channels.reference} does not move.")
     frequency = _strongest(motion, recording.sampling_rate)
     guide = channels.drive or channels.force
     acting = guide is not None and bool(np.ptp(recording.values([guide], 0, _MOST_SAMPLES)[0]) > 0)
@@ -141,14 +142,14 @@ def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
     }
     for kind, channels in kept.items():
         if len(channels) > 1:
-            raise ValueError(
+            raise InputError(
                 f"{recording.name} has several channels of {kind} "
                 f"({', '.join(each.name for each in channels)}): keep the one that drives the mode."
             )
     motions = [channel for channel in recording.channels if channel.quantity in _MOTIONS]
     if not motions:
         listed = ", ".join(map(str, recording.channels))
-        raise ValueError(
+        raise InputError(
             f"{recording.name} has no channel of motion, but {listed}: state units, or name it "
             "velocity_m_s, acceleration_m_s2 or displacement_m."
         )
@@ -163,7 +164,7 @@ def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
     if not at and len(motions) == 1 and not motions[0].point:
         at = {reference: motions[0].name}
     if reference not in at:
-        raise ValueError(
+        raise InputError(
             f"{recording.name} has no motion of the sensor {reference}, where the mode moves most, "
             f"but {', '.join(channel.name for channel in motions)}."
         )
@@ -199,7 +200,7 @@ def _undriven(
     count: int,
 ) -> RecordedTest:
     if not fall.decays:
-        raise ValueError(
+        raise InputError(
             f"{recording.name} has no force or drive that acts, and its motion does not decay "
             f"(its last eighth has {100 * fall.last:.3g} % of the first): it is neither a free "
             "decay nor a forced test."
@@ -216,7 +217,7 @@ def _free_stretches(
     """Stretches without drive, from one cycle after its stop on; none where it never stops."""
     try:
         ring_downs = find_ring_downs(recording, guide, motion)
-    except ValueError:  # the drive never stops; other causes were excluded before
+    except InputError:  # the drive never stops; other causes were excluded before
         return ()
     return tuple(
         (free.start + int(np.ceil(_HERTZ * recording.sampling_rate / free.frequency)), free.stop)
@@ -228,7 +229,7 @@ def _tone(recording: TimeRecording, guide: str) -> ToneTrack | None:
     """The track of a drive that is one slowly varying tone, or None."""
     try:
         track = track_tone(recording, guide)
-    except ValueError:  # no frame holds a tone
+    except InputError:  # no frame holds a tone
         return None
     if len(track.middle) < 3 or np.sum(track.length) / 2 < _TONE_COVERS * recording.n_samples:
         return None
@@ -251,7 +252,7 @@ def _tone_kind(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[
     runs = sweep_runs(track, unwrapped_phase(track))
     if runs:
         return RecordKind.SLOW_SWEEP, Fact("tone_that_moves", channel=guide, n=len(runs))
-    raise ValueError(
+    raise InputError(
         f"{recording.name}: {guide} is a single tone of "
         f"{np.median(track.frequency) * rate / _HERTZ:.5g} Hz, which gives no backbone."
     )
@@ -296,7 +297,7 @@ def _require_near_mode(recording: TimeRecording, low: float, high: float, rest: 
     if low / _FAR <= rest <= high * _FAR:
         return
     where = f"{low / _HERTZ:.4g}" if high == low else f"{low / _HERTZ:.4g} to {high / _HERTZ:.4g}"
-    raise ValueError(
+    raise InputError(
         f"{recording.name} is at {where} Hz, but the mode of interest is at "
         f"{rest / _HERTZ:.4g} Hz: is its time in seconds, and is it a test of this mode?"
     )

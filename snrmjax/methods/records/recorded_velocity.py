@@ -9,6 +9,7 @@ from snrmjax.measure.decays.decay_record import even_record
 from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _HERTZ = 2 * np.pi
 _CORNER = 0.25  # of the motion's frequency: below it an integrated signal is drift
@@ -59,7 +60,7 @@ def recorded_velocity(
 
         ends = int(_ENDS * cycle)
         if len(signal) < 4 * ends:
-            raise ValueError(
+            raise InputError(
                 f"an acceleration needs {4 * _ENDS:g} cycles to be integrated, but the record has "
                 f"{len(signal) / cycle:.3g}."
             )

@@ -29,6 +29,7 @@ from snrmjax.measure.decays.decay_record import (
 from snrmjax.measure.decays.isolated_decay import IsolatedDecay
 from snrmjax.methods.result import MethodPoint, MethodResult, method_result, points_of_curves
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 Reading = Literal["peaks", "zero_crossings", "hilbert"]
 
@@ -79,7 +80,7 @@ def resonant_decay(
     """
     times, signal = checked_record(time, velocity)
     if reading not in get_args(Reading):
-        raise ValueError(f"`reading` must be one of {get_args(Reading)}, but is {reading!r}.")
+        raise InputError(f"`reading` must be one of {get_args(Reading)}, but is {reading!r}.")
     step = float(np.mean(np.diff(times)))
     whole, settled = times, slice(None)
     if band is not None:
@@ -164,14 +165,14 @@ def _filtered(
 
     low, high = band
     if not 0 < low < high < 0.5 / step:
-        raise ValueError(
+        raise InputError(
             f"`band` must rise between 0 and half the sampling rate, {0.5 / step:.4g} Hz, but is "
             f"{low:g} to {high:g} Hz."
         )
     sections = butter(_FILTER_ORDER, band, "bandpass", fs=1 / step, output="sos")
     ends = int(np.ceil(_FILTER_ENDS / ((high - low) * step)))
     if 3 * ends > len(signal):
-        raise ValueError(
+        raise InputError(
             f"a band of {high - low:g} Hz takes {ends * step:.3g} s to settle at each end, "
             f"but the record has {len(signal) * step:.3g} s: widen the band."
         )
@@ -261,7 +262,7 @@ def _local_lines(
     width = max(4, round(window * envelope.per_cycle))
     end = len(envelope.time) if end is None else end
     if end < width:
-        raise ValueError(
+        raise InputError(
             f"{window:g} cycles above the least amplitude are needed, but the record has "
             f"{end / envelope.per_cycle:.3g}."
         )

@@ -21,6 +21,7 @@ from snrmjax.methods.records.resonant_decay import checked_record, velocity_extr
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _POINTS = 25  # amplitudes at which the fitted surface is evaluated
 _ANGLES = 128  # of half a cycle
@@ -72,9 +73,9 @@ def fit_restoring_force(
     from scipy.interpolate import make_interp_spline
 
     if not 1 <= degree <= _MOST:
-        raise ValueError(f"`degree` must be from 1 to {_MOST}, but is {degree}.")
+        raise InputError(f"`degree` must be from 1 to {_MOST}, but is {degree}.")
     if force is not None and modes is None:
-        raise ValueError("`modes` are needed with a force: they give its modal constant.")
+        raise InputError("`modes` are needed with a force: they give its modal constant.")
     times, speed = checked_record(time, velocity)
     curve = make_interp_spline(times, speed, k=_SPLINE)
     acceleration = curve.derivative()(times)
@@ -102,7 +103,7 @@ def fit_restoring_force(
     left = design / scale @ solved + acceleration[inside]
     misfit = float(np.sqrt(np.mean(left**2) / np.mean(acceleration[inside] ** 2)))
     if misfit**2 > most_left:
-        raise ValueError(
+        raise InputError(
             f"the residual of the two forces is {100 * misfit**2:.2g} % of the acceleration's "
             "power: the record has several modes (use `isolate_decay` before), or forces of "
             "another form."
@@ -150,7 +151,7 @@ def restoring_force(
 def _of_length(force: Float[np.ndarray, " sample"], length: int) -> Float[np.ndarray, " sample"]:
     values = np.asarray(force, dtype=float)
     if values.shape != (length,) or not np.isfinite(values).all():
-        raise ValueError(
+        raise InputError(
             f"`force` must be finite and have {length} samples, as `time` has, but it has shape "
             f"{values.shape}."
         )

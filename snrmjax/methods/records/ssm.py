@@ -26,6 +26,7 @@ from snrmjax.methods.records.normal_form import NormalForm, form_of, sensor_sign
 from snrmjax.methods.result import MethodResult, method_result, points_of_curves
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
+from snrmjax.numerics.rules import InputError
 
 _DELAYS = 5  # 2·2 + 1: enough for a plane, by Takens' theorem
 _FEWEST_SAMPLES = 8  # a cycle
@@ -102,7 +103,7 @@ def curves_of_submanifold(manifold: SpectralSubmanifold) -> MethodResult:
     amplitude = np.linspace(manifold.smallest, manifold.largest, _POINTS)
     values = _curves(manifold.form, amplitude)
     if manifold.left > _MOST_LEFT and np.any(values[1] > 0):
-        raise ValueError(
+        raise InputError(
             f"the residual of one decaying mode is {100 * manifold.left:.2g} % of the record's "
             "power: the record has interfering modes; isolate the mode before (`isolate_decay`)."
         )
@@ -136,7 +137,7 @@ def fit_submanifold(
     polynomial, and 1σ does not include its model error.
     """
     if terms is not None and not 1 <= terms <= _MOST_TERMS:
-        raise ValueError(f"`terms` must be from 1 to {_MOST_TERMS}, but is {terms}.")
+        raise InputError(f"`terms` must be from 1 to {_MOST_TERMS}, but is {terms}.")
     times, signal = even_record(time, velocity)
     while len(times) > _MOST_SAMPLES:
         signal, times = decimate(signal, 2, ftype="fir", zero_phase=True), times[::2]
@@ -145,7 +146,7 @@ def fit_submanifold(
     hertz = _main_frequency(signal, step)
     require_cycles(signal, hertz * float(times[-1]))
     if 1 / (hertz * step) < _FEWEST_SAMPLES:
-        raise ValueError(
+        raise InputError(
             f"{_FEWEST_SAMPLES} samples a cycle are needed, but the record has "
             f"{1 / (hertz * step):.1f}: the sampling rate is too low."
         )
@@ -160,7 +161,7 @@ def fit_submanifold(
     orders = tuple(order for order in _ORDERS if order < per_cycle / 2)
     best = _selected(times, signal, coordinate, orders, terms, noise_std)
     if best is None:
-        raise ValueError("the record holds no oscillation that decays smoothly.")
+        raise InputError("the record holds no oscillation that decays smoothly.")
     return _submanifold(best, times, signal, misfit, noise_std)
 
 
@@ -183,7 +184,7 @@ def _on_the_plane(signal: np.ndarray, lag: int) -> tuple[Complex[np.ndarray, " k
     multipliers, left = np.linalg.eig(moved)  # rows: plane(t + lag)ᵀ = plane(t)ᵀ · moved
     k = int(np.argmax(multipliers.imag))
     if not multipliers[k].imag > 0:
-        raise ValueError("the record holds no oscillation in its plane of largest motion.")
+        raise InputError("the record holds no oscillation in its plane of largest motion.")
     rotating = left[:, k] @ plane
     design = np.stack([rotating.real, -rotating.imag], axis=1)
     real, imaginary = np.linalg.lstsq(design, signal[:count], rcond=None)[0]

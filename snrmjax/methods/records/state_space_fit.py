@@ -44,6 +44,7 @@ from snrmjax.methods.records.state_space_start import (
     regressed,
 )
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.rules import InputError
 
 _PER_CYCLE = 32.0  # samples of the model per cycle of the mode
 _FEWEST_SAMPLES = 4.5  # of a record per cycle of the mode
@@ -107,9 +108,9 @@ def fit_state_space(
     (`benchmarks/methods_loops_and_decays.py`).
     """
     if order not in (None, 2, 4, 6):
-        raise ValueError(f"`order` must be 2, 4 or 6 (two states a mode), but is {order}.")
+        raise InputError(f"`order` must be 2, 4 or 6 (two states a mode), but is {order}.")
     if not degrees or not all(2 <= degree <= 7 for degree in degrees):
-        raise ValueError(f"`degrees` must lie between 2 and 7, but are {degrees}.")
+        raise InputError(f"`degrees` must lie between 2 and 7, but are {degrees}.")
     records = (recordings,) if isinstance(recordings, TimeRecording) else tuple(recordings)
     channel = choose_channels(records[0], force, [motion]).responses[0]
     for record in records:
@@ -138,7 +139,7 @@ def fit_state_space(
     simulated = _simulated(model, states, fitted, exponents)
     misfit = _relative(simulated, fitted.velocity)
     if not misfit < _MUCH:
-        raise ValueError(
+        raise InputError(
             f"the residual of the best model of degree {max(degrees)} is "
             f"{100 * misfit:.3g} % of the velocity, more than {100 * _MUCH:g} %: a lower level, "
             "longer periods, more states or other degrees may help."
@@ -180,7 +181,7 @@ def _mode_frequency(linear: MultisineResponses, modes: LinearModes | None) -> fl
         return float(frequency[np.argmax(np.abs(linear.responses.values[0, 0]))])
     natural = modes.natural_frequency.item(modes.mode_of_interest)
     if not frequency[0] <= natural <= frequency[-1]:
-        raise ValueError(
+        raise InputError(
             f"lines around the mode at {natural / (2 * np.pi):.4g} Hz are needed, but the records "
             f"have them from {frequency[0] / (2 * np.pi):.4g} to "
             f"{frequency[-1] / (2 * np.pi):.4g} Hz."
@@ -208,7 +209,7 @@ def _mean_periods(
     rate = records[0].sampling_rate
     samples = round(linear.period * rate)
     if rate < _FEWEST_SAMPLES * natural / (2 * np.pi):
-        raise ValueError(
+        raise InputError(
             f"{_FEWEST_SAMPLES:g} samples a cycle of the mode at {natural / (2 * np.pi):.4g} Hz "
             f"are needed, but the records have {rate:g} Hz: the sampling rate is too low."
         )
@@ -217,7 +218,7 @@ def _mean_periods(
     wanted = _STRETCHES * round(cycles * _PER_CYCLE / _STRETCHES)
     most = _MOST_SAMPLES // wanted
     if most < 1:
-        raise ValueError(
+        raise InputError(
             f"{_MOST_SAMPLES} samples are fitted at most, but a period has {wanted} at "
             f"{_PER_CYCLE:g} a cycle: record shorter periods."
         )

@@ -20,6 +20,7 @@ from jaxtyping import Array, Complex, Float
 from snrmjax.measure.recordings.multisine import MultisineResponses
 from snrmjax.methods.records.state_space import Exponents, StateSpace, hold, response
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
+from snrmjax.numerics.rules import InputError
 
 HIGHEST = 4.0
 """Times the mode's frequency: highest fitted line, beyond the third harmonic."""
@@ -80,7 +81,7 @@ def linear_model(
     multipliers = subspace_poles(z, values, weight, order)
     oscillating = np.sort_complex(multipliers[multipliers.imag > 1e-6])[::-1]
     if len(oscillating) != order // 2:
-        raise ValueError(
+        raise InputError(
             f"the best linear approximation does not have {order // 2} oscillating modes: "
             "excite a band around them, or take another `order`."
         )

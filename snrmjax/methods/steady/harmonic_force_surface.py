@@ -18,6 +18,7 @@ from snrmjax.methods.one_sensor import drive_point, sensor_states
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
 from snrmjax.methods.steady.equal_amplitude import AmplitudeSection, sections_of
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.rules import InputError
 
 _FEWEST_LEVELS, _FEWEST_STATES = 2, 3
 _WITHIN = 2.0  # times the least force: range of the parabola fit
@@ -59,14 +60,14 @@ def force_surface(data: SteadyStates, modes: LinearModes) -> ForceSurface:
     """
     sections = _usable(data, modes)
     if len(sections) < _FEWEST_LEVELS:
-        raise ValueError(
+        raise InputError(
             "two or more levels of controlled displacement with three states each are needed, but "
             f"the data have {len(sections)}."
         )
     low = max(section.frequency[0] for section in sections)
     high = min(section.frequency[-1] for section in sections)
     if not low < high:
-        raise ValueError("levels must share a range of frequencies.")
+        raise InputError("levels must share a range of frequencies.")
     frequencies = np.unique(np.concatenate([section.frequency for section in sections]))
     frequency = frequencies[(frequencies >= low) & (frequencies <= high)]
     rows = sorted(sections, key=lambda section: section.amplitude)

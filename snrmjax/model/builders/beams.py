@@ -13,6 +13,7 @@ import numpy as np
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import Structure, structure
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
 FLAT_BEAM_FORCES = (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2)
@@ -111,7 +112,7 @@ def curved_beam(reading: Literal["monostable", "as_printed"] = "monostable") -> 
     """
     factor = {"monostable": 3.0, "as_printed": 1.0}.get(reading)
     if factor is None:
-        raise ValueError(f'`reading` must be "monostable" or "as_printed", but is {reading!r}.')
+        raise InputError(f'`reading` must be "monostable" or "as_printed", but is {reading!r}.')
     modes = linear_modes(
         HERTZ * np.array([64.78]), [0.05], [[12.77433]], [3341.536], sensors=("midspan",)
     )

@@ -18,7 +18,7 @@ from snrmjax.model.modes import LinearModesStd, OptionalModalData, RigidBodyMode
 from snrmjax.model.moving_base import BaseMotion
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.names import suggestion
-from snrmjax.numerics.rules import POSITIVE, require
+from snrmjax.numerics.rules import POSITIVE, InputError, require
 
 _SYMMETRIC = 1e-8  # of the largest entry: permitted asymmetry, as of finite-element output
 _RIGID = 1e-9  # of the largest of a few ω²: smaller ones belong to rigid-body modes
@@ -91,7 +91,7 @@ def from_matrices(
     m, k = _checked("mass", mass), _checked("stiffness", stiffness)
     size = m.shape[0]
     if k.shape != m.shape:
-        raise ValueError(f"`mass` has shape {m.shape}, but `stiffness` has {k.shape}.")
+        raise InputError(f"`mass` has shape {m.shape}, but `stiffness` has {k.shape}.")
     names = tuple(points) if points is not None else tuple(f"x{i + 1}" for i in range(size))
     check_names(names, size)
     made = checked_effects(effects)
@@ -110,7 +110,7 @@ def from_matrices(
         free, rigid = np.split(rigid @ rotation, [n_free], axis=1)
         squared, shapes = np.pad(squared, (0, n_free)), np.concatenate([shapes, free], axis=1)
     if not n_flexible or not np.any(load @ shapes):
-        raise ValueError(
+        raise InputError(
             "the force excites no mode of the structure."
             if base is None
             else "the base excites no mode of the structure."
@@ -122,7 +122,7 @@ def from_matrices(
     else:
         c = _checked("damping", damping)
         if c.shape != m.shape:
-            raise ValueError(f"`damping` has shape {c.shape}, but there are {size} unknowns.")
+            raise InputError(f"`damping` has shape {c.shape}, but there are {size} unknowns.")
         ratio, coupling, ratio_std = modal_damping(c, m, k, shapes, omega)
     measured = tuple(sensors) if sensors is not None else names
     with_sensor = np.array(_indices(names, measured, "`sensors`"))
@@ -157,7 +157,7 @@ def _load(
 ) -> np.ndarray:
     """Load vector: newtons at the unknowns per newton, or per m/s² of the base."""
     if (force is None) == (base is None):
-        raise ValueError("a structure has either a `force` or a moving `base`.")
+        raise InputError("a structure has either a `force` or a moving `base`.")
     if base is None:
         return _column(names, force or {}, "`force`")
     _indices(names, [point for point, _ in base.along], "the base's `along`")
@@ -167,15 +167,15 @@ def _load(
 def _checked(name: str, matrix: Any) -> Any:
     """A checked square symmetric matrix, dense up to `_DENSE` unknowns."""
     if matrix is None:
-        raise ValueError(f"`{name}` must be a matrix, but is missing.")
+        raise InputError(f"`{name}` must be a matrix, but is missing.")
     sparse = scipy.sparse.issparse(matrix)
     values: Any = matrix.tocsc().astype(float) if sparse else np.asarray(matrix, dtype=np.float64)
     if values.ndim != 2 or values.shape[0] != values.shape[1] or not values.shape[0]:
-        raise ValueError(f"`{name}` must be a square matrix, but has shape {values.shape}.")
+        raise InputError(f"`{name}` must be a square matrix, but has shape {values.shape}.")
     require(f"`{name}`", values.data if sparse else values)
     asymmetry, largest = abs(values - values.T).max(), abs(values).max()
     if asymmetry > _SYMMETRIC * largest:
-        raise ValueError(f"`{name}` must be symmetric, but its two halves differ by {asymmetry:g}.")
+        raise InputError(f"`{name}` must be symmetric, but its two halves differ by {asymmetry:g}.")
     values = 0.5 * (values + values.T)
     return values.toarray() if sparse and values.shape[0] <= _DENSE else values
 
@@ -183,10 +183,10 @@ def _checked(name: str, matrix: Any) -> Any:
 def check_names(names: Sequence[str], size: int) -> None:
     """Refuse names of points whose number differs from the unknowns, or repeated ones."""
     if len(names) != size:
-        raise ValueError(f"`points` names {len(names)} points, but there are {size} unknowns.")
+        raise InputError(f"`points` names {len(names)} points, but there are {size} unknowns.")
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
-        raise ValueError(f"`points` names {name!r} twice.")
+        raise InputError(f"`points` names {name!r} twice.")
 
 
 def _indices(names: tuple[str, ...], points: Iterable[str], what: str) -> list[int]:
@@ -195,7 +195,7 @@ def _indices(names: tuple[str, ...], points: Iterable[str], what: str) -> list[i
     for point in points:
         if point not in index:
             near = suggestion(point, names) or f"; known are {', '.join(names[:12])}"
-            raise ValueError(f"{what} names the point {point!r}, which does not exist{near}.")
+            raise InputError(f"{what} names the point {point!r}, which does not exist{near}.")
     return [index[point] for point in points]
 
 
@@ -214,7 +214,7 @@ def _modes(m: Any, k: Any, n_modes: int | None) -> tuple[np.ndarray, np.ndarray,
     size = m.shape[0]
     wanted = size if n_modes is None else n_modes
     if not 1 <= wanted <= size:
-        raise ValueError(f"`n_modes` must lie between 1 and {size}, but is {n_modes}.")
+        raise InputError(f"`n_modes` must lie between 1 and {size}, but is {n_modes}.")
     if wanted + _MORE < size and (scipy.sparse.issparse(k) or size > _SMALL):
         squared, shapes = _lowest_modes(m, k, wanted + _MORE)
         rigid = _RIGID * squared.max()
@@ -222,12 +222,12 @@ def _modes(m: Any, k: Any, n_modes: int | None) -> tuple[np.ndarray, np.ndarray,
         try:
             squared, shapes = scipy.linalg.eigh(_dense(k), _dense(m))
         except np.linalg.LinAlgError as error:
-            raise ValueError("`mass` must be positive definite, but is not.") from error
+            raise InputError("`mass` must be positive definite, but is not.") from error
         rigid = max(_ROUNDING * size * squared.max(), np.finfo(float).tiny)
     order = np.argsort(squared)
     squared, shapes = squared[order], shapes[:, order]
     if squared[0] < -rigid:
-        raise ValueError(
+        raise InputError(
             "`stiffness` must not be negative, but one of the squared natural frequencies is "
             f"{squared[0]:g} 1/s²: zero displacement is an unstable equilibrium. Write the model "
             "about a stable one, x = x₀ + y, where all spring forces balance: k x + c x³ with "
@@ -259,7 +259,7 @@ def _lowest_modes(m: Any, k: Any, wanted: int) -> tuple[np.ndarray, np.ndarray]:
                 k, wanted, m, sigma=shifts[-1], OPinv=operator
             )
         except RuntimeError as error:
-            raise ValueError(
+            raise InputError(
                 "the lowest modes are lost to rounding: the mesh is too fine for these matrices, "
                 "or `stiffness` and `mass` have a common null space."
             ) from error
@@ -358,7 +358,7 @@ def chain(
         row = np.asarray(values, dtype=np.float64)
         row = np.full(size + 1, row) if row.ndim == 0 else row
         if row.shape != (size + 1,):
-            raise ValueError(
+            raise InputError(
                 f"`{name}` must have {size + 1} numbers, one more than masses, but has {row.size}."
             )
         parts.append(np.diag(row[:-1] + row[1:]) - np.diag(row[1:-1], 1) - np.diag(row[1:-1], -1))
@@ -411,7 +411,7 @@ def beam(
     fixed = {"clamped": 2, "pinned": 1, "free": 0}
     for end in supports:
         if end not in fixed:
-            raise ValueError(f"`supports` must be clamped, pinned or free, but has {end!r}.")
+            raise InputError(f"`supports` must be clamped, pinned or free, but has {end!r}.")
     removed = [*range(fixed[supports[0]]), *(size - 2 + k for k in range(fixed[supports[1]]))]
     keep = np.setdiff1d(np.arange(size), removed)
     mass, stiffness = mass[np.ix_(keep, keep)], stiffness[np.ix_(keep, keep)]

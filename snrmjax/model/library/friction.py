@@ -39,7 +39,7 @@ from snrmjax.model.effect_metadata import (
     parameter,
 )
 from snrmjax.model.library.confounders import FRICTION_OR_FORCE_OFFSET
-from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE
+from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE, InputError
 
 _SLIP = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
 SMOOTHING = 0.05  # width of the smoothed jump of Coulomb's force over the rms velocity
@@ -260,7 +260,7 @@ class IwanMicroslip(AbstractSliders):
     def sliders(self) -> Sliders:
         """Raises `ValueError` before `with_thresholds`."""
         if self.largest_slip is None:
-            raise ValueError(
+            raise InputError(
                 "iwan_microslip has no states yet: `scaled_for` or `with_thresholds` must set its "
                 "largest displacement first."
             )

@@ -17,7 +17,7 @@ from snrmjax.model.effect_base import (
     checked_influence_vector,
 )
 from snrmjax.model.effect_metadata import Argument, Part, Shape, Symmetry, parameter
-from snrmjax.numerics.rules import AT_LEAST_ONE, FRACTION, NOT_NEGATIVE, POSITIVE
+from snrmjax.numerics.rules import AT_LEAST_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, InputError
 
 _PARTS = 4  # integration steps from one sample to the next
 _MOST_CYCLES = 12  # Newton iterations for a periodic force
@@ -178,7 +178,7 @@ class FrictionContact(AbstractHysteresis):
 
     def __check_init__(self) -> None:
         if self.at is None or self.normal_at is None:
-            raise ValueError(
+            raise InputError(
                 "friction_contact needs two attachments: `at` (or `between`) along the surface and "
                 "`normal_at` across it."
             )

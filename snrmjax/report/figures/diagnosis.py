@@ -26,6 +26,7 @@ from snrmjax.model.effect_base import (
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.sampling import sensor_index
 from snrmjax.report.sentences.diagnose import effect_name
 from snrmjax.report.style import (
@@ -140,7 +141,7 @@ def comparison_figure(
     Raises `ValueError` where there is no response or the sensor is missing.
     """
     if not before or not after:
-        raise ValueError("there is no response to show: `before` or `after` is empty.")
+        raise InputError("there is no response to show: `before` or `after` is empty.")
     r = sensor_index(data.sensors, sensor or data.sensors[0])
     frequency, speed = np.asarray(data.frequency) / HERTZ, np.abs(np.asarray(data.velocity))[:, r]
     same = at_curve_force(data, [curve.force for curve in before])
@@ -245,7 +246,7 @@ def effect_laws_figure(
     Validity: the mode of interest alone moves, and harmonically.
     """
     if not model.effects:
-        raise ValueError("there is no effect to show: the model has none.")
+        raise InputError("there is no effect to show: the model has none.")
     r = sensor_index(model.modes.sensors, sensor or model.modes.sensors[0])
     count = len(model.effects)
     columns = min(count, 3)
@@ -364,7 +365,7 @@ def _cycle(effect: AbstractEffect, motion: _Motion, reached: _Reached, order: fl
         linear = jnp.asarray(motion.natural_frequency), jnp.asarray(motion.damping_ratio)
         mass, damping, stiffness = map(float, effect.linear_terms(*linear, jnp.asarray(order)))
         return q, v, (stiffness - mass * reached.frequency**2) * q + damping * v
-    raise ValueError(f"no law can be drawn for an effect of the class {type(effect).__name__}.")
+    raise InputError(f"no law can be drawn for an effect of the class {type(effect).__name__}.")
 
 
 def _axis(effect: AbstractEffect, cycle: Cycle) -> int | None:

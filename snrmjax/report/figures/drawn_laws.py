@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.model.effect_metadata import Argument
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.html import ReportTable, number, with_error
 from snrmjax.report.style import (
     COLUMN,
@@ -39,7 +40,7 @@ def drawn_laws_figure(laws: Sequence[DrawnLaw]) -> Figure:
     Raises `ValueError` without any.
     """
     if not laws:
-        raise ValueError("there is no drawn law to show.")
+        raise InputError("there is no drawn law to show.")
     figure, (row,) = panels(COLUMN if len(laws) == 1 else PAGE, 3.0, 1, len(laws))
     for axes, law in zip(row, laws, strict=True):
         _draw(axes, law)

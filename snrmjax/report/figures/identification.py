@@ -24,6 +24,7 @@ from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import force_velocity_loop
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.sampling import (
     BAND,
     VELOCITY,
@@ -203,7 +204,7 @@ def response_figure(
     every: list[PredictedResponse | ResponseCurve] = [*exact, *predicted]
     forces = sorted({c.force for c in every})
     if not forces:
-        raise ValueError("there is no response to show: `predicted` and `simulated` are empty.")
+        raise InputError("there is no response to show: `predicted` and `simulated` are empty.")
     spans = (
         [frequency_range] if frequency_range else [span_of(c, sensor) for c in predicted or exact]
     )
@@ -277,7 +278,7 @@ def force_velocity_figure(
     good = np.flatnonzero(np.asarray(data.measured)[:, r] & np.isfinite(np.asarray(data.force)))
     wrong = [k for k in states if k not in good]
     if wrong or not len(states):
-        raise ValueError(
+        raise InputError(
             f"`states` must be rows measured at {name!r} under a known force, of which there are "
             f"{len(good)}, but {f'has {wrong[0]}' if wrong else 'is empty'}."
         )
@@ -323,7 +324,7 @@ def modal_damping_figure(
     """
     drawn = [s for s in series if s.points is not None or s.backbone is not None]
     if not drawn:
-        raise ValueError("there is no damping to show: no series has points or a backbone.")
+        raise InputError("there is no damping to show: no series has points or a backbone.")
     figure, ((axes,),) = panels(COLUMN, 3.5, 1, 1)
     curves = [None if s.backbone is None else sample_backbone(s.backbone) for s in drawn]
     largest = [c.amplitude(shown) for c in curves if c]

@@ -13,6 +13,7 @@ from snrmjax.identify.inference.optimal_design import NextMeasurement
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.sampling import (
     BAND,
     VELOCITY,
@@ -80,7 +81,7 @@ def fitted_curves_figure(
     Returns the figure. Raises `ValueError` when there is no fit.
     """
     if not series:
-        raise ValueError("there is no fit to show: `series` is empty.")
+        raise InputError("there is no fit to show: `series` is empty.")
     curves = [sample_fit(one.fit) for one in series]
     unit = unit_for(np.concatenate([curve.amplitude(shown) for curve in curves]), shown.unit)
     reach = [curve.amplitude(shown)[-1] for curve in curves]
@@ -183,7 +184,7 @@ def contributions_figure(rows: Sequence[Contribution]) -> Figure:
     Raises `ValueError` when there is no contribution.
     """
     if not rows:
-        raise ValueError("there is nothing to show: `rows` is empty.")
+        raise InputError("there is nothing to show: `rows` is empty.")
     kinds = Contributions(tuple(rows)).by_kind()
     large = [
         row for row in kinds if max(row.frequency_fraction, row.damping_fraction) >= _LEAST_FRACTION
@@ -222,7 +223,7 @@ def next_measurements_figure(
     Returns the figure. Raises `ValueError` when there is no response.
     """
     if not responses:
-        raise ValueError("there is no response to show: `responses` is empty.")
+        raise InputError("there is no response to show: `responses` is empty.")
     forces = sorted({response.force for response in responses})
     largest = max(float(np.max(np.abs(response.velocity))) for response in responses)
     unit = unit_for(largest, "m/s")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.html import LiveFigures
 from snrmjax.report.style import SERIES
 
@@ -39,7 +40,7 @@ def has_bokeh() -> bool:
 def require_bokeh() -> None:
     """Raises `ValueError` with what to install where Bokeh is missing."""
     if not has_bokeh():
-        raise ValueError(f"{NEEDED}.")
+        raise InputError(f"{NEEDED}.")
 
 
 def panel(title: str, x: str, y: str, *, x_range: Any = None, height: int = 240) -> "figure":

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import unit_in_print
 from snrmjax.report.sampling import BAND, sensor_index, velocity_of
 from snrmjax.report.style import (
@@ -66,7 +67,7 @@ def simulated_response_figure(
     """
     drawn = sorted((c for c in curves if len(c.frequency)), key=lambda c: c.force)
     if not drawn:
-        raise ValueError("there is no response to show: no curve has a point.")
+        raise InputError("there is no response to show: no curve has a point.")
     name = sensor or drawn[0].sensors[0]
     forces = sorted({c.force for c in drawn})
     shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
@@ -104,12 +105,12 @@ def event_curve_figure(curves: Sequence[EventCurve], *, sensor: str | None = Non
     """
     drawn = [c for c in curves if len(c.frequency)]
     if not drawn:
-        raise ValueError("there is no curve of events to show: no curve has a point.")
+        raise InputError("there is no curve of events to show: no curve has a point.")
     name = sensor or drawn[0].sensors[0]
     parameters = sorted({(c.parameter, c.unit) for c in drawn})
     if len(parameters) > 1:
         listed = ", ".join(parameter for parameter, _ in parameters)
-        raise ValueError(f"the curves must be over one parameter, but are over {listed}.")
+        raise InputError(f"the curves must be over one parameter, but are over {listed}.")
     ((parameter, base),) = parameters
     of = unit_for(np.concatenate([c.value for c in drawn]), "N") if base == "N" else None
     scale, label = (of.size, of.name) if of else (1.0, base)
@@ -148,7 +149,7 @@ def quasi_periodic_figure(
     Returns the figure. Raises `ValueError` without a branch or when the sensor is missing.
     """
     if not branches:
-        raise ValueError("there is no quasi-periodic motion to show: no branch was found.")
+        raise InputError("there is no quasi-periodic motion to show: no branch was found.")
     name = sensor or branches[0].sensors[0]
     r = sensor_index(branches[0].sensors, name)
     unit = unit_for(np.concatenate([b.largest_amplitude[:, r] for b in branches]), "m/s")
@@ -194,7 +195,7 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     doi:10.1016/j.ymssp.2008.04.002, for the frequency-energy plot.
     """
     if not len(branch.frequency):
-        raise ValueError("there is no normal mode to show: the branch has no point.")
+        raise InputError("there is no normal mode to show: the branch has no point.")
     name = sensor or branch.sensors[0]
     fundamental = np.abs(velocity_of(branch, name))
     peak = velocity_peaks(branch.velocity[:, :, branch.sensors.index(name)])
@@ -281,7 +282,7 @@ def motions_figure(
     """
     speeds, omega = np.atleast_1d(velocity), np.atleast_1d(frequency) / HERTZ
     if not np.any(np.isfinite(speeds)):
-        raise ValueError("there is no motion to show: none was found.")
+        raise InputError("there is no motion to show: none was found.")
     unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
     figure, upper, lower = amplitude_and_phase(COLUMN, 4.4, sensor, unit)
     steady = np.ones(len(speeds), dtype=bool) if stable is None else stable
@@ -305,10 +306,10 @@ def damped_mode_figure(branch: DampedModeBranch, *, sensor: str | None = None) -
     Returns the figure. Raises `ValueError` when the branch has no point or not this sensor.
     """
     if not len(branch.frequency):
-        raise ValueError("there is no mode to show: the branch has no point.")
+        raise InputError("there is no mode to show: the branch has no point.")
     name = sensor or branch.sensors[0]
     if name not in branch.sensors:
-        raise ValueError(f"`sensor` must be one of {branch.sensors}, but is {name!r}.")
+        raise InputError(f"`sensor` must be one of {branch.sensors}, but is {name!r}.")
     velocity = np.abs(branch.velocity[:, 1, branch.sensors.index(name)])
     return amplitudes_figure(velocity, branch.frequency, branch.damping_ratio, name)
 
@@ -330,7 +331,7 @@ def amplitudes_figure(
     """
     speeds = np.asarray(velocity)
     if not np.any(np.isfinite(speeds)):
-        raise ValueError("there is no mode to show: no point is finite.")
+        raise InputError("there is no mode to show: no point is finite.")
     unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
     level = f"Velocity amplitude ({unit.name})"
     figure, frequencies, dampings = frequency_and_damping(3.2, level, f", at {plain(sensor)}")
@@ -362,7 +363,7 @@ def batch_figure(batch: ResponseBatch) -> Figure:
     )
     every = np.concatenate([velocity[np.isfinite(velocity)] for _, _, velocity in series])
     if not every.size:
-        raise ValueError("there is nothing to show: no member has a peak or a resonance.")
+        raise InputError("there is nothing to show: no member has a peak or a resonance.")
     unit = unit_for(every, "m/s")
     figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
     for (name, frequency, velocity), colour, marker in zip(
@@ -385,7 +386,7 @@ def force_velocity_points(force: np.ndarray, velocity: np.ndarray) -> Figure:
     """
     finite = np.isfinite(force) & np.isfinite(velocity)
     if not finite.any():
-        raise ValueError("there is no force to show: no motion was found.")
+        raise InputError("there is no force to show: no motion was found.")
     speed, load = np.abs(velocity[finite]), force[finite]
     unit, newton = unit_for(speed, "m/s"), unit_for(load, "N")
     figure, ((upper,), (lower,)) = panels(COLUMN, 5.0, 2, 1)
@@ -414,7 +415,7 @@ def points_figure(
     `ValueError` without a finite value.
     """
     if not np.isfinite(y).any():
-        raise ValueError(f"there is nothing to show: {title} has no finite value.")
+        raise InputError(f"there is nothing to show: {title} has no finite value.")
     figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
     axes.plot(x, y, **DOT)
     for limit in limits:

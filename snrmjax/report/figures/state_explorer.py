@@ -12,6 +12,7 @@ import numpy as np
 from snrmjax.identify.inference.identification import Identification
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.rules import InputError
 from snrmjax.pipelines.folded_records import FoldedRecord
 from snrmjax.report.figures.live import (
     legend_at_right,
@@ -52,7 +53,7 @@ def state_explorer(
     from bokeh.models import ColumnDataSource
 
     if len(records) not in (0, data.n_states):
-        raise ValueError(f"`records` must be one a state, {data.n_states}, but are {len(records)}.")
+        raise InputError(f"`records` must be one a state, {data.n_states}, but are {len(records)}.")
     at = sensor if sensor is not None else 0
     if sensor is None and found is not None:
         at = data.sensors.index(found.points.sensor)

@@ -3,6 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.numerics.rules import InputError
 from snrmjax.report.style import (
     COLUMN,
     PAGE,
@@ -43,7 +44,7 @@ def sensitivity_figure(indices: SobolIndices) -> Figure:
     """
     shown = [q for q in range(len(indices.names)) if np.isfinite(indices.total[q]).any()]
     if not shown:
-        raise ValueError("there is nothing to show: no quantity has indices.")
+        raise InputError("there is nothing to show: no quantity has indices.")
     columns, n = min(len(shown), 2), len(indices.input_names)
     rows = -(-len(shown) // columns)
     height = 0.6 + rows * (0.7 + 0.26 * n)

@@ -13,6 +13,7 @@ from functools import cache
 from typing import Any
 
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 Wording = str | Callable[..., str]
 
@@ -57,7 +58,7 @@ def wordings() -> dict[str, Wording]:
         table = importlib.import_module(f"{__name__}.{subject.name}").SENTENCES
         twice = every.keys() & table.keys()
         if twice:
-            raise ValueError(f"worded twice: {enumerated(sorted(twice))}.")
+            raise InputError(f"worded twice: {enumerated(sorted(twice))}.")
         every |= table
     return every
 

@@ -6,6 +6,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.numerics.rules import InputError
+
 
 def positive(name: str, values: Any) -> Float[np.ndarray, " value"]:
     """One or many numbers as a flat array; NaN within `jit`, where they have no values.
@@ -17,16 +19,16 @@ def positive(name: str, values: Any) -> Float[np.ndarray, " value"]:
     numbers = np.asarray(values, dtype=np.float64).ravel()
     wrong = numbers[~((numbers > 0) & np.isfinite(numbers))]
     if wrong.size:
-        raise ValueError(f"`{name}` must be positive and finite, but is {float(wrong[0]):g}.")
+        raise InputError(f"`{name}` must be positive and finite, but is {float(wrong[0]):g}.")
     if not numbers.size:
-        raise ValueError(f"`{name}` must have at least one number, but is empty.")
+        raise InputError(f"`{name}` must have at least one number, but is empty.")
     return numbers
 
 
 def frequency_range(from_frequency: float, to_frequency: float) -> Float[np.ndarray, " end"]:
     """Both ends in rad/s. Raises `ValueError` for an empty, negative or infinite range."""
     if not 0 < from_frequency < to_frequency < np.inf:
-        raise ValueError(
+        raise InputError(
             "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
             f"{float(from_frequency):g} and {float(to_frequency):g} rad/s."
         )

@@ -20,6 +20,7 @@ from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, linear_terms_of
 from snrmjax.numerics.compiled import as_numpy, compiled
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonics import (
     alias_free_samples,
     harmonic_basis,
@@ -252,9 +253,9 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
     Raises `ValueError` as `harmonic_balance` does.
     """
     if harmonic_order < 1:
-        raise ValueError(f"`harmonic_order` must be 1 or more, but is {harmonic_order}.")
+        raise InputError(f"`harmonic_order` must be 1 or more, but is {harmonic_order}.")
     if n_samples is not None and n_samples <= 2 * harmonic_order:
-        raise ValueError(
+        raise InputError(
             f"`n_samples` must be above {2 * harmonic_order}, twice the harmonic order, "
             f"but is {n_samples}."
         )

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 from snrmjax.simulate.continuation.newton import Linearised, Number, Point, Trial
 
@@ -77,7 +78,7 @@ class StepControl(eqx.Module):
 
     def __check_init__(self) -> None:
         if self.max_points < 2:
-            raise ValueError(f"`max_points` must be 2 or more, but is {self.max_points}.")
+            raise InputError(f"`max_points` must be 2 or more, but is {self.max_points}.")
 
     def is_near(self, step: Array, miss: Array, rotation: Array) -> Bool[Array, ""]:
         """Whether a point is near enough to its prediction to be the next one of the curve."""

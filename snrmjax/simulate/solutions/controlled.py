@@ -13,6 +13,7 @@ from snrmjax.model.structures import Structure, linear_terms_of, simulated_struc
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.result import quantity
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
@@ -195,7 +196,7 @@ def phase_controlled(
     positive("largest_force", largest_force)
     model = simulated_structure(model)
     if not model.modes.driven()[model.modes.mode_of_interest]:
-        raise ValueError(
+        raise InputError(
             "the force does not drive the mode of interest, which has no phase to control."
         )
     balance = harmonic_balance(
@@ -259,7 +260,7 @@ def response_controlled(
     shape = np.asarray(model.modes.mode_shape[0])
     j = model.modes.mode_of_interest
     if shape[j] == 0:
-        raise ValueError("the first sensor does not see the mode of interest.")
+        raise InputError("the first sensor does not see the mode of interest.")
     middle = 0.5 * (from_frequency + to_frequency)
     scale = velocity / (abs(shape[j]) * middle)
     # Unit of the unknown force: a tenth of the static force for this displacement.

@@ -11,6 +11,7 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.result import Variable, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import unit_in_print
 from snrmjax.simulate.balance.given_numbers import positive
@@ -234,7 +235,7 @@ def _problem(
 ) -> tuple[EventEquations, Float[Array, " unknown"]]:
     """The equations of an event and its starting point. Raises as `follow_event` does."""
     if kind not in get_args(EventKind):
-        raise ValueError(f"`kind` must be one of {get_args(EventKind)}, but is {kind!r}.")
+        raise InputError(f"`kind` must be one of {get_args(EventKind)}, but is {kind!r}.")
     (load,) = positive("force", force).tolist()
     lower, upper = (float(end) for end in to)
     begin = load
@@ -242,17 +243,17 @@ def _problem(
         checked_names(model, [parameter], "parameter")
         begin = float(parameter_value(model, parameter))
     if not (np.isfinite([lower, upper]).all() and lower < upper):
-        raise ValueError(f"`to` must be two numbers that rise, but is {lower:g} to {upper:g}.")
+        raise InputError(f"`to` must be two numbers that rise, but is {lower:g} to {upper:g}.")
     if not lower <= begin <= upper:
-        raise ValueError(
+        raise InputError(
             f"`to` must hold {parameter}, which is {begin:g}, but goes from {lower:g} to {upper:g}."
         )
     if parameter == FORCE and lower <= 0:
-        raise ValueError(f"`to` must be positive for the force, but begins at {lower:g} N.")
+        raise InputError(f"`to` must be positive for the force, but begins at {lower:g} N.")
     expanded = simulated_structure(model)
     if kind == "neimark_sacker" and expanded.hysteretic:
         names = ", ".join(effect.kind for effect in expanded.hysteretic)
-        raise ValueError(f"a Neimark-Sacker point is not followed with friction ({names}).")
+        raise InputError(f"a Neimark-Sacker point is not followed with friction ({names}).")
     coefficients = np.asarray(start[0], dtype=np.float64)
     frequency = float(np.asarray(start[1]))
     largest = max(load, upper) if parameter == FORCE else load
@@ -285,7 +286,7 @@ def _second_frequency(model: Structure, coefficients: np.ndarray, frequency: flo
     row = floquet_multipliers(model, coefficients[None], np.array([frequency]))[0]
     pairs = row[row.imag > 1e-6 * np.abs(row)]
     if not pairs.size:
-        raise ValueError("the motion at `start` has no pair of complex multipliers to follow.")
+        raise InputError("the motion at `start` has no pair of complex multipliers to follow.")
     nearest = pairs[np.argmin(np.abs(np.abs(pairs) - 1.0))]
     return float(np.angle(nearest)) / (2 * np.pi) * frequency
 

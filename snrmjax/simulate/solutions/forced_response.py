@@ -15,6 +15,7 @@ from snrmjax.numerics.blocks import mapped, on_one_core, taken
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
@@ -182,7 +183,7 @@ def _paired(
     if len(loads) == 1:
         loads = np.repeat(loads, len(members))
     if len(members) != len(loads):
-        raise ValueError(
+        raise InputError(
             f"`models` and `forces` must be as many, or one, but are {len(members)} and "
             f"{len(loads)}."
         )

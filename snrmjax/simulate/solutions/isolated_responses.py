@@ -13,6 +13,7 @@ from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.blocks import as_arrays, on_one_core, padded, taken
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.result import AbstractResult, Variable, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
 from snrmjax.simulate.balance.labelled import HERTZ
@@ -177,7 +178,7 @@ def _starts(
     for coefficients, frequency in search.starts:
         x = np.asarray(coefficients, dtype=np.float64)
         if x.shape != (n, model.n_modes):
-            raise ValueError(
+            raise InputError(
                 f"every start must have coefficients of shape {(n, model.n_modes)}, but one has "
                 f"{x.shape}."
             )

@@ -11,6 +11,7 @@ from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, on_one_core
 from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
@@ -58,10 +59,10 @@ def normal_mode_at_velocities(
     wanted = jnp.atleast_1d(jnp.asarray(velocities, dtype=jnp.float64))
     positive("velocities", wanted)
     if steps < 1:
-        raise ValueError(f"`steps` must be at least 1, but is {steps}.")
+        raise InputError(f"`steps` must be at least 1, but is {steps}.")
     shape = model.modes.mode_shape[0, model.modes.mode_of_interest]
     if have_values(shape) and float(shape) == 0.0:
-        raise ValueError("the first sensor does not see the mode of interest.")
+        raise InputError("the first sensor does not see the mode of interest.")
     return _at_velocities(model, wanted, harmonic_order, steps)
 
 

@@ -19,6 +19,7 @@ from snrmjax.model.structures import (
 from snrmjax.numerics.blocks import by_blocks, on_one_core
 from snrmjax.numerics.compiled import as_numpy, compiled, on_numbers
 from snrmjax.numerics.result import quantity
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import with_sines
 from snrmjax.simulate.continuation.continuation import (
@@ -128,7 +129,7 @@ def nonlinear_normal_mode(
     j = model.modes.mode_of_interest
     omega = model.modes.natural_frequency.item(j)
     if not to_frequency > 0 or to_frequency == omega:
-        raise ValueError(
+        raise InputError(
             "`to_frequency` must be positive and differ from the linear frequency "
             f"{omega:g} rad/s, but is {to_frequency:g} rad/s."
         )

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
@@ -88,10 +89,10 @@ def periodic_motion(
     True
     """
     if condition not in get_args(Condition):
-        raise ValueError(f"`condition` must be one of {get_args(Condition)}, not {condition!r}.")
+        raise InputError(f"`condition` must be one of {get_args(Condition)}, not {condition!r}.")
     if (value is None) == (condition in ("frequency", "velocity")):
         verb = "needs a" if value is None else "takes no"
-        raise ValueError(f'`condition="{condition}"` {verb} `value`.')
+        raise InputError(f'`condition="{condition}"` {verb} `value`.')
     target = None if value is None else jnp.asarray(value, dtype=jnp.float64)
     near = tuple(jnp.asarray(part, dtype=jnp.float64) for part in start)
     load = jnp.asarray(force, dtype=jnp.float64)

@@ -12,6 +12,7 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.result import AbstractResult, quantity, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 from snrmjax.simulate.balance.given_numbers import frequency_range
 from snrmjax.simulate.balance.harmonic_balance import (
@@ -147,11 +148,11 @@ def quasi_periodic_branch(
     model = simulated_structure(model)
     check_quasi_periodic(model)
     if slow_order < 1:
-        raise ValueError(f"`slow_order` must be 1 or more, but is {slow_order}.")
+        raise InputError(f"`slow_order` must be 1 or more, but is {slow_order}.")
     ns_points = response.at_events("neimark_sacker")
     index = event if event is not None else (int(ns_points[0]) if len(ns_points) else None)
     if index is None or index not in ns_points or response.multipliers is None:
-        raise ValueError("`response` has no Neimark-Sacker point there: see `at_events`.")
+        raise InputError("`response` has no Neimark-Sacker point there: see `at_events`.")
     ends = within or (float(response.frequency.min()), float(response.frequency.max()))
     lower, upper = frequency_range(*ends)
 
@@ -175,13 +176,13 @@ def check_quasi_periodic(model: Structure) -> None:
     At most 20 modes, no friction with internal variables.
     """
     if model.n_modes > _MOST_MODES:
-        raise ValueError(
+        raise InputError(
             f"quasi-periodic motions are followed in at most {_MOST_MODES} modes, not "
             f"{model.n_modes}: leave modes out (`n_modes` of `from_matrices`)."
         )
     if model.hysteretic:
         kinds = ", ".join(effect.kind for effect in model.hysteretic)
-        raise ValueError(
+        raise InputError(
             f"quasi-periodic motions with internal variables ({kinds}) cannot be followed."
         )
 
@@ -197,7 +198,7 @@ def _beginning(
     multipliers = np.asarray(response.multipliers)[index]
     oscillating = multipliers[np.abs(multipliers.imag) > 1e-9]
     if not len(oscillating) or np.min(np.abs(np.abs(oscillating) - 1)) > _ON_CIRCLE:
-        raise ValueError("the multipliers of this point do not cross the unit circle in a pair.")
+        raise InputError("the multipliers of this point do not cross the unit circle in a pair.")
     crossing = oscillating[np.argmin(np.abs(np.abs(oscillating) - 1))]
     unit = float(balance.frequency_scale)
     fast = float(response.frequency[index]) / unit

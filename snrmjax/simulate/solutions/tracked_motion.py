@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import jitted, numbers_as_arrays
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.solutions.periodic_motion import (
     Condition,
     PeriodicMotion,
@@ -69,7 +70,7 @@ class TrackedMotion(eqx.Module):
     ) -> None:
         self.motion = periodic_motion(model, force, start, condition=condition, value=value)
         if have_values(self.motion.converged) and not bool(self.motion.converged):
-            raise ValueError(
+            raise InputError(
                 f'no motion with `condition="{condition}"` was found near `start`: take a point of '
                 "a response to this force, such as `curve.point(curve.at_events(…)[0])`."
             )
@@ -92,7 +93,7 @@ class TrackedMotion(eqx.Module):
         superfluous `value`.
         """
         if value is not None and self.value is None:
-            raise ValueError(f'`condition="{self.condition}"` takes no `value`.')
+            raise InputError(f'`condition="{self.condition}"` takes no `value`.')
         known = self.model, self.force, self.value
         new = (
             self.model if model is None else model,
@@ -111,7 +112,7 @@ def _check_alike(known: Structure, new: Structure) -> None:
     parts = ("modes", "monomials", "effects", "numbers")
     for what, one, other in zip(parts, kind(known), kind(new), strict=True):
         if one != other:
-            raise ValueError(f"`model` has other {what} than the one that the motion is known of.")
+            raise InputError(f"`model` has other {what} than the one that the motion is known of.")
 
 
 def _shapes(model: Structure) -> list[tuple[int, ...]]:

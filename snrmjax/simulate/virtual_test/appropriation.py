@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
 from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.virtual_test.recording import VisitedStates
@@ -23,7 +24,7 @@ def phase_limits(appropriation: tuple[float, float]) -> tuple[float, float]:
     """
     low, high = appropriation
     if not 0 <= low < high <= 1:
-        raise ValueError(f"`appropriation` must be a range inside 0…1, but is {appropriation}.")
+        raise InputError(f"`appropriation` must be a range inside 0…1, but is {appropriation}.")
     smallest, largest = np.arccos(np.sqrt([high, low])).tolist()
     return smallest, largest
 

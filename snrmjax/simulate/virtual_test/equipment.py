@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.numerics.rules import InputError
+
 
 class Shaker(NamedTuple):
     """An electrodynamic shaker on its amplifier: U = R i + G v_a, and G i moves the armature.
@@ -39,22 +41,22 @@ def check_shaker(shaker: Shaker) -> None:
     """Raise `ValueError` for impossible parameters of a shaker."""
     limits = min(shaker.largest_voltage, shaker.largest_current)
     if not (shaker.resistance > 0 and limits > 0 and np.min(shaker) >= 0):
-        raise ValueError(
+        raise InputError(
             "a shaker's numbers must not be negative, and its resistance, `largest_voltage` and "
             f"`largest_current` must be positive, but are {shaker}."
         )
     if not np.isfinite(shaker[:5]).all():
-        raise ValueError(f"only the amplifier's limits may be infinite, but {shaker} has others.")
+        raise InputError(f"only the amplifier's limits may be infinite, but {shaker} has others.")
 
 
 def check_instruments(instruments: Instruments, sampling_rate: float) -> None:
     """Raise `ValueError` for impossible parameters of the instruments at this rate (Hz)."""
     force, velocity, corner, order = instruments
     if min(force, velocity) < 0:
-        raise ValueError(f"the instruments' noise must not be negative, but is {instruments}.")
+        raise InputError(f"the instruments' noise must not be negative, but is {instruments}.")
     good = int(order) == order and order >= 1
     if not (good and (0 < corner <= sampling_rate / 2 or corner == np.inf)):
-        raise ValueError(
+        raise InputError(
             f"`filter_corner_hz` must be positive and at most half the sampling rate, "
             f"{sampling_rate / 2:g} Hz, or infinite, and `filter_order` a whole number of at least "
             f"1, but are {corner:g} Hz and {order}."

@@ -33,6 +33,7 @@ from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.virtual_test.equipment import (
     Instruments,
     Shaker,
@@ -130,25 +131,25 @@ class Laboratory(eqx.Module):
         foreign = (AbstractMeasurementEffect, AbstractForceSpectrum)
         kinds = ", ".join(e.kind for e in self.structure.effects if isinstance(e, foreign))
         if kinds:
-            raise ValueError(
+            raise InputError(
                 f"the virtual laboratory has its own shaker and instruments, but the model has "
                 f"{kinds}: state them in `shaker` and `instruments`."
             )
         if self.structure.modes.unbalance is not None:
-            raise ValueError(
+            raise InputError(
                 "the virtual laboratory drives by a shaker, but an unbalance drives the model."
             )
         if self.structure.hysteretic and not self.largest_displacement > 0:
             kinds = ", ".join(effect.kind for effect in self.structure.hysteretic)
-            raise ValueError(
+            raise InputError(
                 f"{kinds} needs `largest_displacement`, in m at the reference sensor, but it is "
                 f"{self.largest_displacement}."
             )
         if self.substeps < 1:
-            raise ValueError(f"`substeps` must be 1 or more, but is {self.substeps}.")
+            raise InputError(f"`substeps` must be 1 or more, but is {self.substeps}.")
         fastest = _fastest(self.structure, self.shaker) / (2 * np.pi)
         if self.sampling_rate * self.substeps < _FEWEST_STEPS * fastest:
-            raise ValueError(
+            raise InputError(
                 f"`sampling_rate` times `substeps` must be {_FEWEST_STEPS} times the highest "
                 f"frequency of structure and contacts, {fastest:.4g} Hz, or more, but is "
                 f"{self.sampling_rate * self.substeps:g} Hz: "
@@ -225,7 +226,7 @@ def run_test(
     record, end = _run(laboratory, laboratory.friction(), controller, begin, sections, noise)
     if laboratory.structure.hysteretic and float(end.largest) > laboratory.reach():
         ratio = float(end.largest) / laboratory.reach()
-        raise ValueError(
+        raise InputError(
             f"the motion reached {ratio * laboratory.largest_displacement:.4g} m at the reference "
             f"sensor, beyond `largest_displacement`, {laboratory.largest_displacement:g} m, up to "
             "which friction is resolved."

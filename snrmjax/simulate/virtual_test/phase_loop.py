@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.virtual_test.laboratory import (
     AbstractController,
@@ -144,7 +145,7 @@ def phase_sweep(
     """
     wanted = np.atleast_1d(np.asarray(phases, dtype=float))
     if not np.all(np.abs(wanted) < np.pi / 2):
-        raise ValueError(f"`phases` must lie within ±90°, but are {phases} rad.")
+        raise InputError(f"`phases` must lie within ±90°, but are {phases} rad.")
     steps = [(voltage, phase) for phase in wanted.tolist()]
     motions, _, seconds = locked_motions(
         laboratory,

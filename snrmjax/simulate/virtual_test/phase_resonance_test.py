@@ -12,6 +12,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.result import AbstractResult, Variable, setting
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
@@ -84,13 +85,13 @@ def phase_resonance_test(
     """
     limits = phase_limits(appropriation)
     if points_per_level < 1:
-        raise ValueError(f"`points_per_level` must be 1 or more, but is {points_per_level}.")
+        raise InputError(f"`points_per_level` must be 1 or more, but is {points_per_level}.")
     check_recording(recording, harmonic_order)
     loads = positive("forces", forces).tolist()
     low, high = frequency_range(from_frequency, to_frequency).tolist()
     visited = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)
     if not len(visited.states.level):
-        raise ValueError(
+        raise InputError(
             "no stable state has an appropriation indicator in the range asked for; widen "
             "`appropriation` or the frequency range."
         )

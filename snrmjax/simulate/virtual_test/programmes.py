@@ -13,6 +13,7 @@ from snrmjax.measure.recordings.time_recording import time_recording
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import reference_sensor
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.virtual_test.laboratory import (
     AbstractController,
@@ -157,7 +158,7 @@ def multisine_test(
     ):
         positive(name, value)
     if not distinct.size or distinct[0] < 1 or distinct[-1] >= period_samples / 2:
-        raise ValueError(
+        raise InputError(
             f"`lines` must lie between 1 and half of `period_samples`, {period_samples / 2:g}, but "
             f"are {lines}."
         )
@@ -225,7 +226,7 @@ def steady_states_of(
     `snrmjax.simulate.periodic_motion`.
     """
     if test.steps is None:
-        raise ValueError("`test` must be a stepped sine: other records have no steady states.")
+        raise InputError("`test` must be a stepped sine: other records have no steady states.")
     modes = laboratory.structure.modes
     sensor, j = reference_sensor(modes), modes.mode_of_interest
     # In records force and velocity agree in sign at resonance; states have the model's.
@@ -251,5 +252,5 @@ def steady_states_of(
     )
     if fitted.states.n_states < len(first):
         reasons = ", ".join(f"{count} {reason}" for reason, count in fitted.counts.reasons)
-        raise ValueError(f"not every step of `test` can be fitted: {reasons}.")
+        raise InputError(f"not every step of `test` can be fitted: {reasons}.")
     return fitted.states

@@ -13,6 +13,7 @@ from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_phasors
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 
@@ -63,13 +64,13 @@ def check_recording(recording: Recording, harmonic_order: int) -> None:
     """Raise `ValueError` for harmonics that are not simulated and for invalid errors."""
     errors, _, keep_harmonics = recording
     if not all(2 <= h <= harmonic_order for h in keep_harmonics):
-        raise ValueError(
+        raise InputError(
             f"`keep_harmonics` must lie between 2 and `harmonic_order` = {harmonic_order}, "
             f"but is {keep_harmonics}."
         )
     for name, value in errors._asdict().items():
         if not 0 <= value < np.inf:
-            raise ValueError(f"the error `{name}` must be zero or positive, but is {value}.")
+            raise InputError(f"the error `{name}` must be zero or positive, but is {value}.")
 
 
 def recorded_states(

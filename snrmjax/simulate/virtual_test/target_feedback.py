@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.virtual_test.laboratory import (
     AbstractController,
@@ -129,7 +130,7 @@ class FeedbackBench:
         if not all(np.isfinite(value) and value > 0 for value in settings[:-1]) or not (
             0 <= settings.filter_rate < np.inf
         ):
-            raise ValueError(f"the settings of the feedback must be positive, but are {settings}.")
+            raise InputError(f"the settings of the feedback must be positive, but are {settings}.")
         self.laboratory, self.settings, self.seed = laboratory, settings, seed
         self.runs = 0
         self.state: LabState | None = None

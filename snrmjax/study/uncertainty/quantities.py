@@ -14,6 +14,7 @@ from snrmjax.model.parameters import checked_names, with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
@@ -97,17 +98,17 @@ def response_quantities(
     """
     for kind in kinds:
         if kind not in get_args(EventKind):
-            raise ValueError(f"`kinds` must be out of {get_args(EventKind)}, but has {kind!r}.")
+            raise InputError(f"`kinds` must be out of {get_args(EventKind)}, but has {kind!r}.")
     inputs = _Inputs(tuple(varied))
     for name in inputs.names:
         if inputs.names.count(name) > 1:
-            raise ValueError(f"{name} varies twice.")
+            raise InputError(f"{name} varies twice.")
     checked = [name for name in inputs.names if name != FORCE]
     if checked and model_of is None:
         checked_names(model, checked)
     if (force is None) != (FORCE in inputs.names):
         verb = "do not have" if force is None else "have"
-        raise ValueError(f"`force` must be given once, but it is {force!r} and `varied` {verb} it.")
+        raise InputError(f"`force` must be given once, but it is {force!r} and `varied` {verb} it.")
     load = np.asarray(1.0 if force is None else force, dtype=np.float64)
     nominal = _Nominal(model, load, None if model_of is None else _series(model_of, inputs))
     settings = ResponseSettings(harmonic_order=harmonic_order, stability=False)
@@ -132,7 +133,7 @@ def response_quantities(
             parts.append(part)
             names += [f"{name}_frequency_hz", f"{name}_velocity_m_s"]
     if not parts:
-        raise ValueError(f"nothing to propagate to: {'; '.join(map(str, notes)) or 'no kinds'}.")
+        raise InputError(f"nothing to propagate to: {'; '.join(map(str, notes)) or 'no kinds'}.")
     value, gradient, hessian = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Quantities(value, gradient, hessian, tuple(names), tuple(notes))
 

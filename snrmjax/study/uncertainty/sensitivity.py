@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, quantity, setting
+from snrmjax.numerics.rules import InputError
 
 if TYPE_CHECKING:
     import xarray
@@ -149,7 +150,7 @@ def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
     study = json.loads(data.attrs["study"])["study"]
     method = study["sampling"]["method"]
     if method != "saltelli":
-        raise ValueError(
+        raise InputError(
             "Sobol' indices need the members of Saltelli's scheme, but the study's sampling is "
             f'{method}: use method = "saltelli".'
         )

@@ -11,6 +11,7 @@ from snrmjax.io.laboratory.arrays.value_tree import Numbers
 from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import unit_meaning
 from snrmjax.io.units import HERTZ
+from snrmjax.numerics.rules import InputError
 
 _FREQUENCY = r"(f|fr|freq|frequency|frequenz|hz)"
 _START = rf"{_FREQUENCY}_?(start|min|begin|first|low|lower)|(start|min|first|low)_?{_FREQUENCY}"
@@ -39,9 +40,9 @@ def axis_of_options(start: float, step: float) -> EvenAxis | None:
     """
     for flag, number in (("start", start), ("step", step)):
         if not 0 <= number < float("inf"):
-            raise ValueError(f"--frequency-{flag} must not be negative, but is {number:g} Hz.")
+            raise InputError(f"--frequency-{flag} must not be negative, but is {number:g} Hz.")
     if start and not step:
-        raise ValueError("--frequency-start needs --frequency-step: the step in Hz.")
+        raise InputError("--frequency-start needs --frequency-step: the step in Hz.")
     return EvenAxis(start, step) if step else None
 
 

@@ -20,6 +20,7 @@ from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _NETCDF = (".nc", ".nc4", ".cdf")  # extensions of netCDF files
 _MOST_OBJECTS = 20_000
@@ -54,7 +55,7 @@ class _Traversal(NamedTuple):
         """Count an object. Raises `ValueError` above the limit."""
         self.objects[0] += 1
         if self.objects[0] > _MOST_OBJECTS:
-            raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
+            raise InputError(f"it has more than {_MOST_OBJECTS} objects")
 
 
 def open_tree(path: Path) -> tuple[dict[str, Node], list[Fact]]:
@@ -90,7 +91,7 @@ def _check_heaps(content: mmap.mmap) -> None:
             size = int.from_bytes(content[position + 8 : position + 16], "little")
             if not int.from_bytes(content[position : position + 2], "little"):
                 if size < _HEAP_HEADER:
-                    raise ValueError("it has a global heap without an end")
+                    raise InputError("it has a global heap without an end")
                 break
             position += _HEAP_HEADER + -(-size // 8) * 8
         start = content.find(_HEAP, start + 1)
@@ -191,7 +192,7 @@ class _ArrayField(list):
 def _references(traversal: _Traversal, item: Any, name: str) -> Node | None:
     """A cell array, or a field of a struct array."""
     if item.size > _MOST_OBJECTS:
-        raise ValueError(f"{name} lists {item.size} entries")
+        raise InputError(f"{name} lists {item.size} entries")
     nodes: list[list[Node]] = []
     # MATLAB arrays are stored transposed.
     for row in np.atleast_2d(item[()]).T:
@@ -243,7 +244,7 @@ def _check_lengths(traversal: _Traversal, item: Any, name: str) -> None:
             raw.seek(start)
             lengths = np.frombuffer(raw.read(count * _LENGTHS.itemsize), _LENGTHS)["length"]
             if (lengths > traversal.size).any():
-                raise ValueError(f"{name} has a string of {lengths.max()} characters")
+                raise InputError(f"{name} has a string of {lengths.max()} characters")
 
 
 def _cannot_hold(traversal: _Traversal, item: Any) -> str:

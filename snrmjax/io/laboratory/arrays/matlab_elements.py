@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from math import prod
 from typing import NamedTuple
 
+from snrmjax.numerics.rules import InputError
+
 _CHAR, _SIGNED, _UNSIGNED, _MATRIX, _COMPRESSED, _UTF8 = 1, 5, 6, 14, 15, 16  # types of elements
 _BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
 _CELL, _STRUCT, _OBJECT, _TEXT, _SPARSE, _FUNCTION, _OPAQUE = 1, 2, 3, 4, 5, 16, 17  # of arrays
@@ -48,7 +50,7 @@ def checked_variables(content: bytes) -> list[MatlabVariable]:
         if kind == _COMPRESSED:
             kind, body = _inflated(body, order)
         if kind != _MATRIX:
-            raise ValueError(f"it has an element of the type {kind} among its variables")
+            raise InputError(f"it has an element of the type {kind} among its variables")
         variables.append(_variable(body, order))
     return [one for one in variables if one is not None]
 
@@ -57,11 +59,11 @@ def _inflated(body: memoryview, order: str) -> _Element:
     """A compressed variable, inflated if its declared size is possible."""
     kind, size = struct.unpack(f"{order}II", zlib.decompressobj().decompress(body, 8))
     if size > _INFLATES * len(body):
-        raise ValueError(f"it states {size} bytes that {len(body)} compressed ones cannot hold")
+        raise InputError(f"it states {size} bytes that {len(body)} compressed ones cannot hold")
     stream = zlib.decompressobj()
     inflated = stream.decompress(body, 8 + size + 8)
     if not stream.eof or len(inflated) < 8 + size:
-        raise ValueError("it has a compressed variable of another size than stated")
+        raise InputError("it has a compressed variable of another size than stated")
     return _Element(kind, memoryview(inflated)[8 : 8 + size])
 
 
@@ -74,9 +76,9 @@ def _elements(content: memoryview, order: str) -> Iterator[_Element]:
         if kind >> 16:  # small data element format
             kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
         if kind not in _BYTES and kind not in (_MATRIX, _COMPRESSED):
-            raise ValueError(f"it has an element of the type {kind}")
+            raise InputError(f"it has an element of the type {kind}")
         if start + size > len(content) or (start == position + 4 and (size > 4 or kind == _MATRIX)):
-            raise ValueError(f"it has an element of {size} bytes where fewer are left")
+            raise InputError(f"it has an element of {size} bytes where fewer are left")
         yield _Element(kind, content[start : start + size])
         position += (
             8 if start == position + 4 else 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
@@ -101,7 +103,7 @@ def _variable(body: memoryview, order: str) -> MatlabVariable | None:
 def _check_array(body: memoryview, order: str, depth: int) -> None:
     """Raises `ValueError` unless an array's contents match its class, flags and dimensions."""
     if depth > _DEEPEST:
-        raise ValueError(f"it has arrays within arrays, more than {_DEEPEST} deep")
+        raise InputError(f"it has arrays within arrays, more than {_DEEPEST} deep")
     if not body:
         return  # an empty one
     parts = _elements(body, order)
@@ -112,10 +114,10 @@ def _check_array(body: memoryview, order: str, depth: int) -> None:
     if array_class in _NUMERIC:
         for _ in range(2 if flags & _COMPLEX else 1):
             if _numbers(parts) != count:
-                raise ValueError(f"it has an array without its numbers, which are {count}")
+                raise InputError(f"it has an array without its numbers, which are {count}")
     elif array_class == _TEXT:
         if not _numbers(parts) and count > _MOST_WITHOUT_BYTES:
-            raise ValueError(f"it has a text of {count} characters and no byte")
+            raise InputError(f"it has a text of {count} characters and no byte")
     elif array_class == _SPARSE:
         for _ in range(4 if flags & _COMPLEX else 3):
             _numbers(parts)
@@ -123,10 +125,10 @@ def _check_array(body: memoryview, order: str, depth: int) -> None:
         for _ in range(_inner_arrays(parts, array_class, count, order)):
             kind, inner = _next(parts)
             if kind != _MATRIX:
-                raise ValueError(f"it has an array with the type {kind} for one of its entries")
+                raise InputError(f"it has an array with the type {kind} for one of its entries")
             _check_array(inner, order, depth + 1)
     if depth and next(parts, None) is not None:
-        raise ValueError("it has an array with more than its contents")
+        raise InputError("it has an array with more than its contents")
 
 
 def _inner_arrays(parts: Iterator[_Element], array_class: int, count: int, order: str) -> int:
@@ -139,15 +141,15 @@ def _inner_arrays(parts: Iterator[_Element], array_class: int, count: int, order
         _name(parts), _name(parts)  # names of its type system and class
         return 1
     if array_class not in (_STRUCT, _OBJECT):
-        raise ValueError(f"it has an array of the class {array_class}")
+        raise InputError(f"it has an array of the class {array_class}")
     if array_class == _OBJECT:
         _name(parts)
     lengths = _integers(parts, order)
     if len(lengths) != 1 or lengths[0] < 1:
-        raise ValueError(f"it has a struct whose names have {lengths} characters")
+        raise InputError(f"it has a struct whose names have {lengths} characters")
     fields = len(_text(parts)) // lengths[0]
     if not fields and count > _MOST_WITHOUT_BYTES:
-        raise ValueError(f"it has {count} structs and no field")
+        raise InputError(f"it has {count} structs and no field")
     return count * fields
 
 
@@ -155,14 +157,14 @@ def _next(parts: Iterator[_Element]) -> _Element:
     """The next element; raises `ValueError` where there is none."""
     element = next(parts, None)
     if element is None:
-        raise ValueError("it has an array without its contents")
+        raise InputError("it has an array without its contents")
     return element
 
 
 def _flags(parts: Iterator[_Element], order: str) -> int:
     kind, content = _next(parts)
     if kind != _UNSIGNED or len(content) != 8:
-        raise ValueError("it has an array without its flags")
+        raise InputError("it has an array without its flags")
     flags: int = struct.unpack_from(f"{order}I", content)[0]
     return flags
 
@@ -170,21 +172,21 @@ def _flags(parts: Iterator[_Element], order: str) -> int:
 def _integers(parts: Iterator[_Element], order: str) -> tuple[int, ...]:
     kind, content = _next(parts)
     if kind not in (_SIGNED, _UNSIGNED) or len(content) % 4:
-        raise ValueError(f"it has whole numbers of the type {kind}, {len(content)} bytes of them")
+        raise InputError(f"it has whole numbers of the type {kind}, {len(content)} bytes of them")
     return struct.unpack(f"{order}{len(content) // 4}i", content)
 
 
 def _dimensions(parts: Iterator[_Element], order: str) -> tuple[int, ...]:
     dimensions = _integers(parts, order)
     if not 2 <= len(dimensions) <= _MOST_DIMENSIONS or min(dimensions) < 0:
-        raise ValueError(f"it has an array with the dimensions {dimensions}")
+        raise InputError(f"it has an array with the dimensions {dimensions}")
     return dimensions
 
 
 def _text(parts: Iterator[_Element]) -> memoryview:
     kind, content = _next(parts)
     if kind not in (_CHAR, _UTF8):
-        raise ValueError(f"it has a name of the type {kind}")
+        raise InputError(f"it has a name of the type {kind}")
     return content
 
 
@@ -196,5 +198,5 @@ def _numbers(parts: Iterator[_Element]) -> int:
     """Number of values in the next element."""
     element = next(parts, None)
     if element is None or element.kind not in _BYTES:
-        raise ValueError("it has an array without its numbers")
+        raise InputError("it has an array without its numbers")
     return len(element.content) // _BYTES[element.kind]

@@ -14,6 +14,7 @@ from snrmjax.io.laboratory.arrays.value_tree import Node, in_memory
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _LARGEST = 2**29  # bytes of a file before v7.3, which is read at once, and numbers in a variable
 
@@ -38,7 +39,7 @@ def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:
 
     n_bytes = path.stat().st_size
     if n_bytes > _LARGEST:
-        raise ValueError(
+        raise InputError(
             f"{path.name} has {n_bytes / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB "
             "limit of a file before v7.3: save it with `-v7.3`, which is read block by "
             "block."
@@ -70,7 +71,7 @@ def _of_level_4(path: Path) -> list[MatlabVariable]:
     variables = scipy.io.whosmat(path)
     for name, dimensions, _ in variables:
         if np.prod(dimensions, dtype=float) > _LARGEST:
-            raise ValueError(f"{name} states {' by '.join(map(str, dimensions))} numbers")
+            raise InputError(f"{name} states {' by '.join(map(str, dimensions))} numbers")
     return [MatlabVariable(name) for name, _, _ in variables]
 
 

@@ -16,6 +16,7 @@ from snrmjax.io.laboratory.arrays.value_tree import Node, in_memory
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.text.fields import text_of
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _DEEPEST = 24
 _LONGEST_RANGE = 2**24
@@ -66,7 +67,7 @@ class _Lines:
     def next(self) -> str:
         """The next line."""
         if not self.left:
-            raise ValueError(f"{self.file} is truncated: it ends within a variable.")
+            raise InputError(f"{self.file} is truncated: it ends within a variable.")
         self._at += 1
         return self._lines[self._at - 1]
 
@@ -90,9 +91,9 @@ class _Lines:
             raise self.damaged("a number of rows", word)
         return int(word)
 
-    def damaged(self, wanted: str, line: str) -> ValueError:
+    def damaged(self, wanted: str, line: str) -> InputError:
         """The error for an invalid line."""
-        return ValueError(
+        return InputError(
             f"{self.file} is damaged: line {self._at} must be {wanted}, but is {shown(line)}."
         )
 
@@ -110,7 +111,7 @@ class _Lines:
     def numbers(self, n_lines: int, count: int, *, is_complex: bool) -> np.ndarray:
         """The `count` numbers on the next `n_lines` lines."""
         if n_lines > self.left:
-            raise ValueError(f"{self.file} is truncated: it ends within a variable.")
+            raise InputError(f"{self.file} is truncated: it ends within a variable.")
         first, texts = self._at + 1, [self.next() for _ in range(n_lines)]
         text = " ".join(texts)
         if is_complex:
@@ -120,11 +121,11 @@ class _Lines:
         try:
             values = np.array(words, dtype=float)
         except ValueError as error:
-            raise ValueError(
+            raise InputError(
                 f"{self.file} is damaged: lines {first} to {self._at} must be numbers."
             ) from error
         if len(values) != each * count:
-            raise ValueError(
+            raise InputError(
                 f"{self.file} is damaged: lines {first} to {self._at} have "
                 f"{len(values) / each:g} numbers, but {count} are stated."
             )
@@ -134,7 +135,7 @@ class _Lines:
 def _value(lines: _Lines, name: str, depth: int) -> Node | None:
     """The value of a variable, of a field or of a cell; None with a note if it is not read."""
     if depth > _DEEPEST:
-        raise ValueError(f"{name} of {lines.file} nests too deeply.")
+        raise InputError(f"{name} of {lines.file} nests too deeply.")
     kind = lines.stated("type").removeprefix("global ").removeprefix("float ")
     if kind in _TEXTS:
         return _text(lines)
@@ -201,7 +202,7 @@ def _cell(lines: _Lines, name: str, depth: int) -> Node:
     dimensions = lines.dimensions()
     count = int(np.prod(dimensions, dtype=object))
     if count > lines.left:
-        raise ValueError(f"{lines.file} is truncated: it ends within {name}.")
+        raise InputError(f"{lines.file} is truncated: it ends within {name}.")
     cells: list[Node] = []
     for k in range(count):
         lines.stated("name")

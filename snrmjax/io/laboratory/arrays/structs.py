@@ -24,6 +24,7 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _HERTZ = 2 * np.pi
 _MOST_ENTRIES = 10_000
@@ -148,7 +149,7 @@ def _entries(
 ) -> Struct:
     """A list with one struct a level: tables stacked, with the entry's number."""
     if len(structs) > _MOST_ENTRIES:
-        raise ValueError(f"{name} is a list of {len(structs)} entries, more than {_MOST_ENTRIES}.")
+        raise InputError(f"{name} is a list of {len(structs)} entries, more than {_MOST_ENTRIES}.")
     several = len(structs) > 1
     contents = Struct([], [], {}, [])
     parts: dict[str, list[tuple[int, NumberTable]]] = {}

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Num
 
 from snrmjax.measure.recordings.time_recording import AbstractSamples
+from snrmjax.numerics.rules import InputError
 
 Selection = tuple[slice, ...]
 _MOST_IN_MEMORY = 2**24  # largest array (numbers) that is read at once: 128 MiB of float64
@@ -47,7 +48,7 @@ class Numbers(NamedTuple):
     def all(self, name: str) -> Num[np.ndarray, "..."]:
         """The whole array, types unchanged. Raises `ValueError` above the size limit."""
         if self.size > _MOST_IN_MEMORY:
-            raise ValueError(
+            raise InputError(
                 f"{name} has {self.size} numbers, more than a table may hold ({_MOST_IN_MEMORY}): "
                 "keep long records as time records with an even time vector or a sampling rate."
             )

@@ -18,6 +18,7 @@ from snrmjax.io.laboratory.text.fields import (
     number_in,
 )
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 
 def read_columns(
@@ -42,7 +43,7 @@ def read_columns(
         least = len(line.split()) if separator == " " else stripped.count(separator) + 1
         most = least if separator == " " else line.count(separator) + 1
         if (least > width or most < width) and '"' not in line:
-            raise ValueError(
+            raise InputError(
                 f"row {k} of {file} has {least} fields, but the first row of numbers has {width}."
             )
     stripped_rows = [_cut(line, separator, width) for _, line in rows]
@@ -62,7 +63,7 @@ def read_columns(
         )
     except (ValueError, OverflowError) as error:  # includes the errors of pandas
         message = " ".join(str(error).split())[:160]
-        raise ValueError(f"{file} is damaged or no table of text ({message}).") from error
+        raise InputError(f"{file} is damaged or no table of text ({message}).") from error
     columns: dict[str, np.ndarray | list[str]] = {}
     for name, column in table.items():
         if column.dtype.kind in "biuf":
@@ -79,7 +80,7 @@ def read_columns(
         words = [k for k in texts if k not in numbers]
         if 2 * len(words) < len(rows):
             if words:
-                raise ValueError(
+                raise InputError(
                     f"column {name} must be numbers, but row {words[0]} of {file} has "
                     f"{shown(texts[words[0]])}."
                 )
@@ -105,7 +106,7 @@ def _numbers_of_texts(
         by_other = {k: number_in(text, other, thousands=True) for k, text in texts.items()}
         odd = next((k for k in texts if numbers[k] is not None and by_other[k] is None), None)
         if odd is not None:
-            raise ValueError(
+            raise InputError(
                 f"column {name} of {file} has decimal commas and decimal points: row {odd} has "
                 f"{shown(texts[odd])}, row {foreign[0]} {shown(texts[foreign[0]])}."
             )
@@ -144,7 +145,7 @@ def _refuse_ambiguous(rows: list[tuple[int, str]], separator: str, file: str) ->
                 return
     if first is not None and has_whole:
         row, field = first
-        raise ValueError(
+        raise InputError(
             f"is {field} in row {row} of {file} {float(field.replace(',', '.')):g} or "
             f"{re.sub('[.,]', '', field)}? Its other numbers do not show it: --decimal point or "
             "comma."
@@ -170,7 +171,7 @@ def _refuse_thousands(fields: Mapping[int, str], decimal: str, name: str, file: 
     whole = [field for k, field in fields.items() if k not in ambiguous and field]
     row = next((k for k, field in ambiguous.items() if field.endswith("0")), None)
     if whole and row is not None and not any(mark in field for field in whole):
-        raise ValueError(
+        raise InputError(
             f"is {ambiguous[row]} in row {row} of {file} a thousand or more? Column {name} has "
             f"{whole[0]}, too, as if {shown(mark)} separated thousands, and is elsewhere the "
             "decimal mark: --decimal point or comma."

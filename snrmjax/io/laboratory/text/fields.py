@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 from snrmjax.io.files import shown
+from snrmjax.numerics.rules import InputError
 
 _LARGEST = 2**28  # bytes
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
@@ -18,20 +19,20 @@ def text_of(path: Path) -> str:
     """
     size = path.stat().st_size
     if size > _LARGEST:
-        raise ValueError(
+        raise InputError(
             f"{path.name} has {size / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB "
             "limit of a text: use HDF5, MATLAB v7.3 or TDMS for long records."
         )
     content = path.read_bytes()
     wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     if not wide and b"\0" in content:
-        raise ValueError(f"{path.name} is of no known format (it has NUL bytes).")
+        raise InputError(f"{path.name} is of no known format (it has NUL bytes).")
     for encoding in ("utf-16",) if wide else ("utf-8-sig", "cp1252"):
         try:
             return content.decode(encoding)
         except UnicodeDecodeError:
             continue
-    raise ValueError(f"{path.name} is of no known format (it is no text).")
+    raise InputError(f"{path.name} is of no known format (it is no text).")
 
 
 def fields_of(line: str, separator: str) -> list[str]:
@@ -44,7 +45,7 @@ def fields_of(line: str, separator: str) -> list[str]:
     try:
         fields = [field.strip() for field in next(csv.reader([line], delimiter=separator), [])]
     except csv.Error as error:
-        raise ValueError(f"a line of the file has unbalanced quotes: {shown(line)}.") from error
+        raise InputError(f"a line of the file has unbalanced quotes: {shown(line)}.") from error
     while fields and not fields[-1]:
         fields.pop()
     return fields

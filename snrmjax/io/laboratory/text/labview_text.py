@@ -19,6 +19,7 @@ from snrmjax.io.laboratory.text.fields import SEPARATORS, fields_of, number_in, 
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import SamplesInMemory, TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _END = "***End_of_Header***"
 _X = "X_Value"
@@ -38,7 +39,7 @@ class _Style(NamedTuple):
         value = number_in(field, "point")
         value = number_in(field, "comma") if value is None else value
         if value is None:
-            raise ValueError(f"{self.file} is damaged: its {what} is {field!r}.")
+            raise InputError(f"{self.file} is damaged: its {what} is {field!r}.")
         return value
 
 
@@ -107,7 +108,7 @@ def _style(lines: Sequence[str], file: str) -> tuple[_Style, int]:
     """Format from the file header, and the index of the first line below it."""
     end = next((k for k, line in enumerate(lines) if line.startswith(_END)), None)
     if end is None:
-        raise ValueError(f"{file} is damaged: its header has no end ({_END}).")
+        raise InputError(f"{file} is damaged: its header has no end ({_END}).")
     entries: dict[str, str] = {}
     for line in lines[1:end]:
         separator = "\t" if "\t" in line else ","
@@ -117,13 +118,13 @@ def _style(lines: Sequence[str], file: str) -> tuple[_Style, int]:
     separator = SEPARATORS.get({"": "tab", ",": "comma", ";": "semicolon"}.get(stated, stated), "")
     x_columns = entries.get("X_Columns", "One").lower()
     if not separator or x_columns not in ("no", "one", "multi"):
-        raise ValueError(
+        raise InputError(
             f"{file} states the separator {entries.get('Separator')!r} and X_Columns "
             f"{entries.get('X_Columns')!r}: Tab, Comma or Semicolon, and No, One or Multi exist."
         )
     decimal = {".": "point", ",": "comma"}.get(entries.get("Decimal_Separator", "."), "")
     if not decimal or (separator, decimal) == (",", "comma"):
-        raise ValueError(
+        raise InputError(
             f"{file} states the separator {stated} and the decimal mark "
             f"{entries.get('Decimal_Separator')!r}, which cannot be distinguished."
         )
@@ -150,7 +151,7 @@ def _segments(
             segments.append(({}, []))
             in_header = True
         if not segments:
-            raise ValueError(
+            raise InputError(
                 f"line {k} of {style.file} belongs to no segment: its header lacks Channels."
             )
         header, rows = segments[-1]
@@ -164,7 +165,7 @@ def _segments(
         else:
             header[fields[0]] = fields
     if not segments:
-        raise ValueError(f"{style.file} has no segment: it has only a header.")
+        raise InputError(f"{style.file} has no segment: it has only a header.")
     return segments
 
 
@@ -181,14 +182,14 @@ def _columns(
     stated = header.get("Channels", ["", ""])
     count = int(style.number(stated[1], "number of channels")) if len(stated) > 1 else 0
     if names[0] != _X or count != len(channel_columns):
-        raise ValueError(
+        raise InputError(
             f"{file} states {count} channels, but its row of names has "
             f"{len(channel_columns)}: {', '.join(names)}."
         )
     longest = max(len(fields) for _, fields in rows)
     if longest > len(names) and not (longest == last + 1 and names[-1] != "Comment"):
         row = next(k for k, fields in rows if len(fields) == longest)
-        raise ValueError(
+        raise InputError(
             f"line {row} of {file} has {longest} fields, but its row of names has {len(names)}."
         )
     table = {index: _numbers(rows, index, style) for index in range(last)}
@@ -222,7 +223,7 @@ def _columns(
         step = style.number(header_field("Delta_X"), "Delta_X") if header_field("Delta_X") else 0.0
         step = _exact_step(header_field("Delta_X"), step, notes) if step > 0 else step
         if style.x_columns == "no" and step <= 0:
-            raise ValueError(f"{file} states no step (Delta_X) of channel {name}, and no times.")
+            raise InputError(f"{file} states no step (Delta_X) of channel {name}, and no times.")
         columns.append(
             _Column(
                 name,
@@ -251,7 +252,7 @@ def _numbers(rows: Sequence[tuple[int, list[str]]], index: int, style: _Style) -
             continue
         value = number_in(field, style.decimal)
         if value is None:
-            raise ValueError(
+            raise InputError(
                 f"line {line} of {style.file} must be numbers with a decimal {style.decimal}, but "
                 f"has {field[:40]!r}."
             )

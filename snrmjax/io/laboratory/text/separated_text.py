@@ -23,6 +23,7 @@ from snrmjax.io.laboratory.text.fields import (
     text_of,
 )
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _INSPECTED_LINES = 200  # lines searched for the first row of numbers
 _MOST_COLUMNS = 4096
@@ -136,7 +137,7 @@ def _marks(lines: list[str], stated: TextFormat, file: str) -> tuple[str, str]:
     }
     if not scores:
         begins = f": it begins with {shown(inspected[0].strip())}" if inspected else ""
-        raise ValueError(
+        raise InputError(
             f"{file} has no row of numbers in its first {_INSPECTED_LINES} lines{begins}."
         )
     return max(scores, key=lambda marks: scores[marks])
@@ -190,10 +191,10 @@ def _first_row(
     )
     widths = {k: len(fields) for k, fields in split if _is_row(fields, decimal)}
     if not widths:
-        raise ValueError(f"{file} has no row of numbers below row {start}.")
+        raise InputError(f"{file} has no row of numbers below row {start}.")
     width = max(widths.values())
     if width > _MOST_COLUMNS:
-        raise ValueError(f"{file} has {width} columns, more than {_MOST_COLUMNS}.")
+        raise InputError(f"{file} has {width} columns, more than {_MOST_COLUMNS}.")
     # The first rows may lack their last values: the widest row sets the number of columns.
     first = next(k for k in widths if widths[k] == width)
     return first, width
@@ -222,12 +223,12 @@ def _header(
     if at >= 0:
         count = len(fields_of(lines[at].lstrip("#%!/ "), separator)) if at < first else 0
         if count != width:
-            raise ValueError(
+            raise InputError(
                 f"--header-row {at + 1} of {file} has {count} names, but the rows of numbers below "
                 f"have {width} columns."
             )
         if not re.search(r"[^\W\d]", "".join(rows[at]).lower().replace("e", "")):
-            raise ValueError(f"--header-row {at + 1} of {file} has numbers, not names.")
+            raise InputError(f"--header-row {at + 1} of {file} has numbers, not names.")
         names, below = rows[at], [rows[k] for k in rows if k > at]
     else:
         filled = {k: sum(bool(field) for field in row) for k, row in rows.items()}

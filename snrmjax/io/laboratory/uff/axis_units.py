@@ -7,6 +7,7 @@ from snrmjax.io.laboratory.physical_units import is_per_force, level_reference, 
 from snrmjax.io.laboratory.uff.data_sets import stated
 from snrmjax.measure.recordings.channels import SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _QUANTITIES: dict[int, Quantity] = {
     8: "displacement",
@@ -41,7 +42,7 @@ def unit_system(sets: Sequence[Mapping[str, Any]]) -> UnitSystem:
     function = sets[0]
     length, force = float(function["length"]), float(function["force"])
     if not (0 < length < float("inf") and 0 < force < float("inf")):
-        raise ValueError(f"the factors of units (data set 164) must be positive: {length}, {force}")
+        raise InputError(f"the factors of units (data set 164) must be positive: {length}, {force}")
     if length == force == 1:
         return UnitSystem()
     name = stated(function["units_description"])

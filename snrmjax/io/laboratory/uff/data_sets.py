@@ -9,6 +9,7 @@ import numpy as np
 
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _LARGEST = 2**29  # bytes: pyuff reads the whole file, with a temporary object per number
 _READ = {58: "function", 151: "header", 164: "units"}
@@ -49,13 +50,13 @@ def read_data_sets(path: Path) -> DataSets:
     pyuff = library("pyuff", "reading universal files")
     file, n_bytes = path.name, path.stat().st_size
     if n_bytes > _LARGEST:
-        raise ValueError(
+        raise InputError(
             f"{file} has {n_bytes / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB limit "
             "of a universal file: split it, or use HDF5 or TDMS for long records."
         )
     content = path.read_bytes()
     if len(_TAG.findall(content)) % 2:
-        raise ValueError(f"{file} is damaged: it ends within a data set (no closing -1).")
+        raise InputError(f"{file} is damaged: it ends within a data set (no closing -1).")
     sets: list[Mapping[str, Any]] = []
     left_out: dict[int, int] = {}
     with damaged_if_it_fails(file, "a universal file"):
@@ -125,12 +126,12 @@ def _check_count(header: Mapping[str, Any], n_bytes: int, file: str, number: int
     """Refuse a function that declares more points than the file can hold."""
     points, code = header["num_pts"], header["ord_data_type"]
     if code not in (2, 4, 5, 6):
-        raise ValueError(
+        raise InputError(
             f"data set {number} of {file} has the ordinate type {code}, but 2, 4, 5 and 6 exist."
         )
     each = (2 if code > 4 else 1) * (4 if code in (2, 5) else _SHORTEST)
     if points < 1 or points * each > n_bytes:
-        raise ValueError(
+        raise InputError(
             f"data set {number} of {file} states {points} points, which a file of {n_bytes} bytes "
             "cannot hold."
         )
@@ -141,9 +142,9 @@ def _checked_function(function: dict[str, Any], file: str, number: int) -> dict[
     points = function["num_pts"]
     x, data = np.asarray(function["x"], float), np.asarray(function["data"])
     if min(x.size, data.size) < points:
-        raise ValueError(
+        raise InputError(
             f"data set {number} of {file} states {points} points, but has {data.size}."
         )
     if not np.isfinite(x[:points]).all() or not np.isfinite(function["z_axis_value"]):
-        raise ValueError(f"data set {number} of {file} has an abscissa that is not finite.")
+        raise InputError(f"data set {number} of {file} has an abscissa that is not finite.")
     return {**function, "x": x[:points], "data": data[:points], "number": number}

@@ -14,6 +14,7 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 _HERTZ = 2 * np.pi
 _MOST_NOTES = 20
@@ -137,7 +138,7 @@ def _recording(group: Sequence[_Function], source: _Source) -> TimeRecording | N
         return None
     channels = _unique([source.channel(function, "rsp", "ordinate") for function in group])
     if any(np.iscomplexobj(function["data"]) for function in group):
-        raise ValueError("a time record cannot have complex numbers.")
+        raise InputError("a time record cannot have complex numbers.")
     described = [stated(function["id1"]) for function in group]
     descriptions = [
         Fact("channel_described", name=channel.name, text=text)
