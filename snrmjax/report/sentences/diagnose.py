@@ -120,6 +120,8 @@ def _part_of_change(
 ) -> str:
     laws = " and ".join(effect_names(group, "or") for group in classes)
     if part == "instrument":
+        if verdict == "drawn":
+            return f"Probable instrument error: {laws} ({probability_in_words(probability)})."
         return f"Instrument error: {laws}."
     what = f"the change of {part} with amplitude"
     if part.startswith("harmonic"):
