@@ -172,7 +172,7 @@ def _print_done(done: "StudyRun", out: Path) -> None:
     if done.damaged_chunks:
         warn(f"{done.damaged_chunks} chunks were damaged; they were computed again.")
     if done.failed and not done.complete:
-        warn(f"{done.failed} of {done.computed} members have no whole result: see `status`.")
+        warn(f"{done.failed} of {done.computed} members have no complete result: see `status`.")
     if not done.complete:
         print_line(f"this shard is done; {done.missing_chunks} chunks are left to other shards.")
     elif done.computed:
@@ -254,7 +254,7 @@ class _Lines:
 
 def _line(now: "Progress") -> str:
     done = f"{now.done}/{now.members} members"
-    return f"{done}, {now.failed} without a whole result, {now.per_second:.3g}/s"
+    return f"{done}, {now.failed} without a complete result, {now.per_second:.3g}/s"
 
 
 def _duration(seconds: float) -> str:

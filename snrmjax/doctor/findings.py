@@ -48,7 +48,7 @@ _MEANINGS = {
     "severity": "error, warning or info",
     "where": "file, level, rows or channel",
     "evidence": "in numbers",
-    "mend": "what mends it",
+    "mend": "the remedy",
 }
 
 

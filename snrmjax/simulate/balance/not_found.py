@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 def nan_unless(found: Bool[Array, ""], values: T, by: PyTree) -> T:
-    """`values` if `found`; else NaN, with NaN derivatives with respect to the numbers of `by`.
+    """`values` if `found`, else NaN, with NaN derivatives with respect to the numbers of `by`.
 
     Zero derivatives would make an optimiser believe it has converged. In reverse mode they are NaN
     only where the result depends on the missing values: a member of a batch that a sum leaves out

@@ -36,7 +36,7 @@ COMPLETE = (
     *(MemberStatus.SOLVED, MemberStatus.ANSWERED, MemberStatus.LARGEST_VELOCITY),
     *("upper_end", "lower_end", "closed"),
 )
-"""Statuses of members with a whole result."""
+"""Statuses of members with a complete result."""
 
 
 class Failure(NamedTuple):
