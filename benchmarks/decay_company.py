@@ -26,6 +26,7 @@ import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
 from snrmjax.methods.record_comparison import run_record_method
 from snrmjax.methods.records.recorded_test import recorded_test
+from snrmjax.numerics.rules import InputError
 
 tell = teller(__file__)
 
@@ -203,7 +204,7 @@ def main() -> None:
             try:
                 found = run_record_method(name, [recorded_test(record, modes)], modes)
                 result, why = found.result, found.reason
-            except ValueError as error:
+            except InputError as error:
                 result, why = None, str(error)
             if result is None or not result.found.any():
                 refused[name][one.close] += 1

@@ -9,7 +9,7 @@ cut, bits flipped, counts made huge, runs overwritten, NaN put in, parts doubled
 two formats spliced, gzip and zip around them, one in another. Each is
 listed, and what it holds is read and imported, in a child process whose address space may grow by
 1 GiB, with ten seconds a file; the peak of resident memory above that after the imports is
-measured file by file (Linux). Good is: data, or a `ValueError` of one sentence; of a text every
+measured file by file (Linux). Good is: data, or a `InputError` of one sentence; of a text every
 number that was read must stand in it. Everything else is bad and is kept beside the temporary
 folder for a look.
 
@@ -33,6 +33,8 @@ from pathlib import Path
 
 import numpy as np
 from harness import options, teller
+
+from snrmjax.numerics.rules import InputError
 
 tell = teller(__file__)
 
@@ -297,7 +299,7 @@ def digest(path):
 
     try:
         held = read_laboratory_file(path)
-    except ValueError as error:
+    except InputError as error:
         return checked(error, "refused")
     outcome = "data"
     listed_contents(held)
@@ -308,7 +310,7 @@ def digest(path):
         try:
             record.values(stop=min(record.n_samples, 2**16))
             record.values(start=max(0, record.n_samples - 100))
-        except ValueError as error:
+        except InputError as error:
             outcome = checked(error, "refused late")
     first = held.recordings[0].channel_names if held.recordings else ()
     table = list(held.tables[0].columns) if held.tables else []
@@ -327,7 +329,7 @@ def digest(path):
         )
         try:
             import_files([path], told)
-        except ValueError as error:
+        except InputError as error:
             checked(error, "")
     return outcome
 
@@ -335,7 +337,7 @@ def digest(path):
 def checked(error, outcome):
     """The outcome of an error, which must be one sentence of the package's own."""
     text = str(error)
-    if "\n" in text.strip() or len(text) > 2000 or type(error).__module__ != "builtins":
+    if "\n" in text.strip() or len(text) > 2000 or not isinstance(error, InputError):
         return f"BAD message: {type(error).__name__}: {text[:200]}"
     return outcome
 

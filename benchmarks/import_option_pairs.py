@@ -21,6 +21,8 @@ import numpy as np
 from harness import options, teller
 from typer.testing import CliRunner
 
+from snrmjax.numerics.rules import InputError
+
 tell = teller(__file__)
 
 HERTZ, POUND, GRAVITY = 2 * np.pi, 4.4482216152605, 9.80665
@@ -225,10 +227,10 @@ def run(app, folder, file, added):
     out = folder / "out"
     shutil.rmtree(out, ignore_errors=True)
     result = CliRunner().invoke(app, ["import", *words, "--out", str(out)])
-    said = str(result.exception) if isinstance(result.exception, ValueError) else result.output
-    if result.exception is not None and not isinstance(result.exception, ValueError | SystemExit):
+    said = str(result.exception) if isinstance(result.exception, InputError) else result.output
+    if result.exception is not None and not isinstance(result.exception, InputError | SystemExit):
         return 3, repr(result.exception), None
-    code = 2 if isinstance(result.exception, ValueError) else result.exit_code
+    code = 2 if isinstance(result.exception, InputError) else result.exit_code
     measured = out / "measured.csv"
     return code, said, measured.read_text() if measured.is_file() else None
 

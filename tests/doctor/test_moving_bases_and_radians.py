@@ -5,7 +5,7 @@ import pytest
 from truths.one_mode import OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
-from snrmjax.measure.base_excitation import relative_to_base
+from snrmjax.measure.base_excitation import states_relative_to_base
 from snrmjax.model.modes import OptionalModalData
 from snrmjax.model.moving_base import base_motion
 
@@ -29,7 +29,7 @@ def on_a_base(recorded, declared, seed=0):
         sensors=("tip",),
         beside=OptionalModalData(base=base_motion(declared)),
     )
-    return relative_to_base(data, modes.base), sj.model.structure(modes)
+    return states_relative_to_base(data, modes.base), sj.model.structure(modes)
 
 
 @pytest.mark.parametrize(

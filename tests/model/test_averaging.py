@@ -120,12 +120,12 @@ def test_amplitudes_and_frequencies_broadcast():
 
 
 @pytest.mark.parametrize(("kind", "corners"), [("gap_stiffness", 2), ("one_sided_stop", 1)])
-def test_contacts_are_sharp_and_exact_between_samples(kind, nonsmooth_points):
+def test_contacts_are_sharp_and_exact_between_samples(kind, corners):
     stiffness, gap = 1.3, 0.4
     effect = make_effect(kind, {"stiffness": stiffness, "gap": gap})
     amplitude = np.array([0.3, 0.4001, 0.5, 0.9, 4.0])
     average = averaged_effect(effect, jnp.asarray(amplitude), jnp.array(2.0), n_samples=256)
-    wanted = 0.5 * nonsmooth_points * stiffness * engaged(amplitude)
+    wanted = 0.5 * corners * stiffness * engaged(amplitude)
     np.testing.assert_allclose(average.stiffness, wanted, rtol=0, atol=1e-7)
     np.testing.assert_allclose(average.damping, 0.0, atol=1e-8)
 
