@@ -165,7 +165,7 @@ def test_a_diagnosis_looks_for_an_own_effect_and_a_simulation_has_it(folder):
         ("1 / 0", "own.py cannot be loaded: ZeroDivisionError: division by zero."),
         ("raise SystemExit(3)", "own.py cannot be loaded: SystemExit: 3."),
         ("import snrmjax", "own.py defines no effect: a class with a `kind`"),
-        (QUINTIC.replace("own_quintic", "cubic_stiffness"), "kind 'cubic_stiffness' already"),
+        (QUINTIC.replace("own_quintic", "cubic_stiffness"), "kind 'cubic_stiffness' is already"),
     ],
 )
 def test_a_file_that_is_none_of_effects_is_refused_in_a_sentence(folder, capsys, text, words):

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import snrmjax as sj
 from snrmjax.cli import app
+from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 
 COMMANDS = {
@@ -92,7 +93,7 @@ pytestmark = pytest.mark.usefixtures("optimised")  # whole searches, of which ea
 )
 def test_results_are_the_same_where_every_sentence_is_x(files, tmp_path, monkeypatch, name):
     read = results(files, tmp_path / "read", name)
-    assert read["exit"] == ((1, ValueError) if name == "stopped" else (0, type(None)))
+    assert read["exit"] == ((1, InputError) if name == "stopped" else (0, type(None)))
     assert (len(read) > 1) == (name != "stopped")
     monkeypatch.setattr("snrmjax.report.sentences.sentence", lambda fact: "x")
     monkeypatch.setattr("snrmjax.report.printed.screen_of", lambda result: "x")

@@ -109,7 +109,7 @@ def test_few_states_and_voltages_are_left_alone():
 def test_an_error_of_identification_has_its_cause():
     data = few(lambda w, f, v: (f, v / (1j * w)))
     message = str(with_caveat(ValueError("no points."), data, model()))
-    assert message.startswith("no points. the responses are displacements")
+    assert message.startswith("no points. the responses appear to be displacements")
     assert str(with_caveat(ValueError("no points."), few(), model())) == "no points."
 
 

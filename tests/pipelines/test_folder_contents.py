@@ -155,7 +155,7 @@ def test_a_rate_of_few_digits_must_be_stated(tmp_path):
         read_test_files(tmp_path)
     (one,) = read_test_files(tmp_path, rate=2048.0).records
     assert one.record.sampling_rate == 2048.0
-    with pytest.raises(ValueError, match="which of both is right"):
+    with pytest.raises(ValueError, match="which is right"):
         read_test_files(tmp_path, rate=1000.0)
     (tmp_path / "map.toml").write_text("rate = 2050.0\n")
     (one,) = read_test_files(tmp_path).records

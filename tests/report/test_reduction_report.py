@@ -147,7 +147,7 @@ def test_a_scale_whose_model_is_none_of_the_structure_is_refused():
     with pytest.raises(ValueError, match=r"1111 differs by -\d+ % .* leave the key out"):
         reduce_model(spring._replace(load_scale=30.0), study=False)
     _, jumping = softening(last=4.0)
-    with pytest.raises(ValueError, match=r"leaves \d+ % of the nonlinear force of its own load"):
+    with pytest.raises(ValueError, match=r"is \d+ % of the nonlinear force of its own load"):
         reduce_model(jumping._replace(load_scale=2.0), study=False)
 
 

@@ -54,7 +54,7 @@ def inverse_force(model: Structure, data: SteadyStates, *, harmonic_order: int =
     of the reference sensor. It equals the measured force where model and measurement are right.
     Differentiable once with respect to the model's parameters, in forward and reverse mode, by the
     implicit function theorem; states without a solution have derivatives zero or NaN and do not
-    affect the others. Not differentiable with respect to the data, which are prepared on the host.
+    affect the others. There are no derivatives by the data, which are prepared on the host.
     Raises `ValueError` for sensors other than the model's and for an unknown force or phase.
 
     >>> import snrmjax as sj

@@ -160,7 +160,7 @@ def test_a_bad_beam_is_refused_with_one_sentence(tmp_path, capsys, monkeypatch, 
     [
         ([], "needs one of BEAM, --tables and --calculix, but has none of them"),
         (["beam.toml", "--tables", "tables"], "but has BEAM and --tables"),
-        (["beam.toml", "--modes", "1,3"], "`--modes` goes with --calculix"),
+        (["beam.toml", "--modes", "1,3"], "`--modes` needs --calculix"),
         (["nowhere.toml"], "nowhere.toml does not exist"),
         (["--tables", "nowhere"], "nowhere does not exist"),
     ],

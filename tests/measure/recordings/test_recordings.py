@@ -92,7 +92,7 @@ def test_responses_are_in_si_and_become_receptances():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frequency": (2.0, 1.0)}, "rise"),
+        ({"frequency": (2.0, 1.0)}, "ascending"),
         ({"frequency": (1.0,)}, "must have shape"),
         ({"values": np.full((1, 1, 2), np.nan)}, "not all missing"),
         ({"values": np.full((1, 1, 2), np.inf)}, "must be finite"),
