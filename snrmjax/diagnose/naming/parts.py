@@ -363,7 +363,10 @@ def _remainder(problem: Problem, assessed: list[Assessed], part: str, best: Asse
     change = _changes(problem, best.cell, best.solved, part)
     functions = problem.remainders(part, x)
     order = np.argsort(readings.relative_amplitude)
-    at_states = change.of_law @ change.strength
+    # Instrument errors are no curves of amplitude: states are corrected for them instead.
+    kinds = [problem.columns[c].kind for c in best.cell.columns]
+    erring = np.array([part in DRAWN and is_instrument(kind) for kind in kinds], dtype=bool)
+    at_states = change.of_law @ (change.strength * ~erring)
     laws = np.interp(x, readings.relative_amplitude[order], at_states[order])
     if part in DRAWN:
         unit: Any = 1.0 if part == "stiffness" else 0.5
@@ -375,6 +378,7 @@ def _remainder(problem: Problem, assessed: list[Assessed], part: str, best: Asse
         if part == "damping":
             beyond = np.imag(readings.beyond) / (2 * natural * readings.frequency)
             beyond = beyond - damping_error * readings.linear.damping_std
+        beyond = beyond - unit * (change.of_law @ (change.strength * erring))
         std = _std_along(functions, change.covariance)
         value = functions @ change.rest
     else:  # magnitudes of the velocity at the sensor

@@ -12,6 +12,7 @@ from snrmjax.diagnose.naming.hypotheses import hypotheses_of
 from snrmjax.diagnose.naming.readings import readings_of
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.naming.rows import Cell, problem_of, solved
+from snrmjax.model.effects import EFFECTS
 
 LAWS = ("cubic_stiffness", "quintic_stiffness", "quadratic_damping", "coulomb_friction")
 
@@ -138,6 +139,24 @@ def test_friction_is_found_where_errors_of_levels_are_unknown(seed):
     (group,) = damping.candidates
     assert "coulomb_friction" in group
     assert {*group} <= {"coulomb_friction", "force_offset_error"}
+
+
+def test_states_are_drawn_without_the_error_of_an_instrument():
+    """A phase error of 3° changes states by their phase; what is left is the cubic spring."""
+    read = readings(lambda x: 0.1 * x**2, nothing)
+    turned = read._replace(
+        rows=read.whitened(read.beyond - 1j * np.radians(3) * read.dynamic_stiffness)
+    )
+    turned = turned._replace(beyond=read.beyond - 1j * np.radians(3) * read.dynamic_stiffness)
+    problem, cells = hypotheses.best_hypotheses(turned, EFFECTS)
+    found = parts.naming_of(problem, cells)
+    assert "sensor_phase_error" in found.effects
+    part = next(one for one in found.parts if one.part == "stiffness")
+    wanted = 0.1 * read.relative_amplitude**2
+    np.testing.assert_allclose(part.remainder.state_change, wanted, atol=1e-3)
+    x = part.remainder.velocity / part.remainder.velocity[-1]
+    at_states = np.interp(read.relative_amplitude, x, part.remainder.laws)
+    np.testing.assert_allclose(at_states, wanted, atol=2e-3)
 
 
 def test_readings_do_not_change_with_units_of_force():
