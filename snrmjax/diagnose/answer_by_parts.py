@@ -21,7 +21,8 @@ from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit, fit_effe
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.naming.parts import DRAWN, Naming, PartAnswer, Remainder
+from snrmjax.diagnose.naming.assessed import DRAWN
+from snrmjax.diagnose.naming.parts import Naming, PartAnswer, Remainder
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.verdict import Kinds, Verdict, answer_of
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR

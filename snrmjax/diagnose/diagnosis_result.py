@@ -16,7 +16,8 @@ from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.fitted_effects import TriedEffect
 from snrmjax.diagnose.misfit.locating import Located
-from snrmjax.diagnose.naming.parts import DRAWN, PartAnswer
+from snrmjax.diagnose.naming.assessed import DRAWN
+from snrmjax.diagnose.naming.parts import PartAnswer
 from snrmjax.diagnose.verdict import Kinds, Verdict
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect

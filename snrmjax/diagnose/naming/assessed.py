@@ -11,6 +11,7 @@ DRAWN = {"stiffness": StiffnessLaw.kind, "damping": DisplacementDampingLaw.kind}
 """Effect kinds of the remainder of each part."""
 
 Laws = tuple[str, ...]
+_ALTERNATIVE = 0.02  # probability, from which on a law or an error counts as an alternative
 
 
 class Assessed(NamedTuple):
@@ -51,7 +52,7 @@ def classes_of(assessed: list[Assessed], part: str) -> tuple[Laws, tuple[Laws, .
         both = sum(
             one.weight for one in assessed if law in one.laws[part] and first in one.laws[part]
         )
-        if inclusion[law] >= 0.02 and both < 0.5 * inclusion[law]:
+        if inclusion[law] >= _ALTERNATIVE and both < 0.5 * inclusion[law]:
             group.append(law)
     groups = [tuple(group)]
     for law in left:
@@ -86,7 +87,7 @@ def _with_instrument_errors(assessed: list[Assessed], part: str, law: str) -> li
     alternatives = {
         kind
         for kind, p in instead.items()
-        if p >= 0.02 and anywhere[kind] < priors.NAMED and both.get(kind, 0.0) < 0.5 * p
+        if p >= _ALTERNATIVE and anywhere[kind] < priors.NAMED and both.get(kind, 0.0) < 0.5 * p
     }
     laws = ({*one.laws[part], *(alternatives & {*one.instead(part)})} for one in assessed)
     return [

@@ -59,13 +59,13 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
         problem = problem.with_columns([*left, *finer])
     problem = _with_likeliest_length(readings, problem.columns)
     cells = hypotheses_of(problem)
-    with_laws = with_level_errors_of_laws(problem, cells)
+    with_laws = _with_level_errors_of_laws(problem, cells)
     if with_laws is problem:
         return problem, cells
     return with_laws, hypotheses_of(with_laws)
 
 
-def with_level_errors_of_laws(problem: Problem, cells: list[Cell]) -> Problem:
+def _with_level_errors_of_laws(problem: Problem, cells: list[Cell]) -> Problem:
     """The problem with an alternative: level errors as estimated together with laws.
 
     Smooth curves attribute half of a steep change, such as that of friction, to errors of the

@@ -126,9 +126,9 @@ def test_pairs_left_out_are_irrelevant():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_friction_is_found_where_errors_of_levels_are_unknown(seed):
-    """Six states a level at resonance: friction is steep, and half taken for levels' errors.
+    """Near resonance friction changes the damping steeply, which level errors must not absorb.
 
-    At resonance an offset of the force does the same: one or the other.
+    An offset of the force has the same effect there: either of them may be the answer.
     """
     test = {"phases": (-4.0, -2.5, -1, 1, 2.5, 4), "level_std": (0.0,) * 4, "noise": 1e-2}
     friction = (lambda x: 0.1 * x**2), (lambda x, om: 2 * RATIO * 0.01 / (x * om))
@@ -142,13 +142,11 @@ def test_friction_is_found_where_errors_of_levels_are_unknown(seed):
 
 
 def test_states_are_drawn_without_the_error_of_an_instrument():
-    """A phase error of 3° changes states by their phase; what is left is the cubic spring."""
+    """With a phase error of 3° corrected, the states lie on the curve of the cubic spring."""
     read = readings(lambda x: 0.1 * x**2, nothing)
-    turned = read._replace(
-        rows=read.whitened(read.beyond - 1j * np.radians(3) * read.dynamic_stiffness)
-    )
-    turned = turned._replace(beyond=read.beyond - 1j * np.radians(3) * read.dynamic_stiffness)
-    problem, cells = hypotheses.best_hypotheses(turned, EFFECTS)
+    beyond = read.beyond - 1j * np.radians(3) * read.dynamic_stiffness
+    recorded = read._replace(rows=read.whitened(beyond), beyond=beyond)
+    problem, cells = hypotheses.best_hypotheses(recorded, EFFECTS)
     found = parts.naming_of(problem, cells)
     assert "sensor_phase_error" in found.effects
     part = next(one for one in found.parts if one.part == "stiffness")
