@@ -121,8 +121,8 @@ def _part_of_change(
     laws = " and ".join(effect_names(group, "or") for group in classes)
     if part == "instrument":
         if verdict == "drawn":
-            return f"Probable instrument error: {laws} ({probability_in_words(probability)})."
-        return f"Instrument error: {laws}."
+            return f"The records probably show {laws} ({probability_in_words(probability)})."
+        return f"The records show {laws}."
     what = f"the change of {part} with amplitude"
     if part.startswith("harmonic"):
         what = part.replace("_", " ")
