@@ -45,8 +45,6 @@ from snrmjax.model.modes import linear_response, residual_velocity
 from snrmjax.numerics.blocks import padded
 
 _ANY_PHASE = 1.0  # rad, 1σ of an unrecorded phase about its estimate
-_SEEN_BY_HARMONICS = (AbstractAddedMode, ModeShapeChange)
-"""Effects that only harmonics distinguish from a law: the fundamental of one sensor fits both."""
 
 
 class NamedParts(NamedTuple):
@@ -66,7 +64,10 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     if unknown.any():
         predictions = _with_likely_phases(predictions, data)
     if not predictions.chosen.orders or unknown.any():
-        kinds = [k for k in kinds if not issubclass(EFFECTS[k], _SEEN_BY_HARMONICS)]
+        unseen: tuple[type, ...] = (AbstractAddedMode,)
+        if unknown.any() or not predictions.given.potential.monomials:
+            unseen = (*unseen, ModeShapeChange)
+        kinds = [k for k in kinds if not issubclass(EFFECTS[k], unseen)]
     readings = _readings(predictions, data, unknown)
     if readings.posterior.phase_is_controlled:
         kinds = [k for k in kinds if _shows_at_one_phase(k)]
@@ -213,6 +214,7 @@ def _motion_of_model(
         needed = force * (1 + parts[:, :, 0])
         # Residual modes respond to the force that the model needs, not to the measured one.
         mode = own + rest[:, sensor] * (force - needed)
-        return ModelMotion(1j * omega * driven * needed / (mode * to_mode), higher)
+        with np.errstate(invalid="ignore"):  # NaN where the model has no such motion
+            return ModelMotion(1j * omega * driven * needed / (mode * to_mode), higher)
 
     return balanced

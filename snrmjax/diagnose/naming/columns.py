@@ -29,7 +29,7 @@ class Column(NamedTuple):
     change: Complex[np.ndarray, " state"]  # of the dynamic stiffness, over ω₀²; largest entry 1
     higher: Complex[np.ndarray, "order state"]  # of its other recorded harmonics, likewise
     scale: float  # divisor of that change: strength 1 in the units of `describing`
-    sign: int = 0  # physical sign of the strength; 0: either
+    limits: tuple[float, float] = (-np.inf, np.inf)  # of the strength
     std: float | None = None  # 1σ of the strength of an instrument error; None: over `STRENGTHS`
     fraction: float = 1.0  # weight within its kind's prior
     widths: tuple[float, ...] = ()  # of the intervals about the shape
@@ -110,7 +110,11 @@ def _column(
         for index, one in enumerate(readings.harmonics):
             higher[index] = law.higher(readings, one, *shape)
     shapes = {"shape": tuple(map(float, shape)), "widths": tuple(map(float, widths))}
-    return _scaled(kind, change, higher, fraction=fraction, sign=law.sign, std=law.std, **shapes)
+    limits = (-np.inf if law.sign <= 0 else 0.0, np.inf if law.sign >= 0 else 0.0)
+    if law.unit is not None:  # the shape is the strength for which the change is exact
+        low, high = shape[0] - widths[0] / 2, shape[0] + widths[0] / 2
+        limits, fraction = (float(low / law.unit), float(high / law.unit)), 1.0
+    return _scaled(kind, change, higher, fraction=fraction, limits=limits, std=law.std, **shapes)
 
 
 def _scaled(

@@ -38,7 +38,7 @@ def detection_limits(
         kind, detectable = column.kind, by_rows
         if not (is_instrument(kind) or np.any(column.higher)):
             detectable = max(by_rows, smallest / float(np.max(np.abs(column.change))))
-        sign = column.sign or 1
+        sign = -1 if column.limits[1] <= 0 else 1
         values = parameters_of(problem.readings, column, sign * detectable)
         if values is None or not np.isfinite(detectable):
             continue

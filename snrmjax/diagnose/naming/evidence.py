@@ -2,7 +2,7 @@
 
 With the standard deviations of the remainders fixed, rows y = Aθ + e have e ~ N(0, C). Sufficient
 for the columns A are b = AᵀC⁻¹y and S = AᵀC⁻¹A, from one Cholesky factor; for θ ~ N(0, τ²) the
-evidences are one- and two-dimensional Gaussian integrals, over a half-space if the sign is known.
+evidences are one- and two-dimensional Gaussian integrals, between the limits of each strength.
 Blocks of rows share only the laws, so that their b and S add up.
 """
 
@@ -26,7 +26,7 @@ from snrmjax.diagnose.naming.rows import (
 from snrmjax.model.library.measurement_chain import ForceHarmonics
 
 _ALIKE = 2 * (priors.BAND * priors.DESCRIBED) ** 2  # least sin² of the angle between two laws
-PRIOR_OF_PAIRS = np.log(priors.EFFECT_COUNTS[2]) + 5 * np.log(2)  # at most, with both signs known
+PRIOR_OF_PAIRS = np.log(priors.EFFECT_COUNTS[2]) + 3 * np.log(2)  # at most
 
 
 def remainder_stds(every: int) -> list[float]:
@@ -50,7 +50,8 @@ class LawSums(NamedTuple):
     b: Float[np.ndarray, " column"]
     gram: Float[np.ndarray, "column column"]
     kind: np.ndarray  # of every column
-    sign: Int[np.ndarray, " column"]
+    low: Float[np.ndarray, " column"]  # limits of the strength
+    high: Float[np.ndarray, " column"]
     std: Float[np.ndarray, " column"]  # NaN: over `STRENGTHS`
     prior: Float[np.ndarray, " column"]  # probability among single laws
 
@@ -71,6 +72,9 @@ class LawSums(NamedTuple):
         kinds = [column.kind for column in columns]
         odds = {kind: odds_of(kind) for kind in dict.fromkeys(kinds)}
         every = sum(odds.values())
+        low, high = np.array([column.limits for column in columns]).reshape(-1, 2).T
+        # A known sign doubles the prior density; other limits leave it as it is.
+        one_sided = np.where((low == 0) & np.isposinf(high) | np.isneginf(low) & (high == 0), 2, 1)
         return cls(
             remainder_std,
             levels[0],
@@ -78,9 +82,10 @@ class LawSums(NamedTuple):
             gram[:-1, -1],
             gram[:-1, :-1],
             np.array(kinds),
-            np.array([column.sign for column in columns]),
+            low,
+            high,
             np.array([np.nan if c.std is None else c.std for c in columns]),
-            np.array([odds[c.kind] / every * c.fraction for c in columns]),
+            np.array([odds[c.kind] / every * c.fraction for c in columns]) * one_sided,
         )
 
     def with_rows_of(self, other: "LawSums") -> "LawSums":
@@ -177,7 +182,7 @@ class LawSums(NamedTuple):
         precision = square[..., None] + narrow
         mean = b[..., None] / precision
         value = 0.5 * b[..., None] * mean - 0.5 * np.log(precision / narrow)
-        value = value + _log_half(self.sign[:, None], mean * np.sqrt(precision))
+        value = value + _log_within(self.low[:, None], self.high[:, None], mean, np.sqrt(precision))
         return logsumexp(value, axis=-1) - np.log(value.shape[-1])
 
     def _likely(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -206,8 +211,9 @@ class LawSums(NamedTuple):
         det = np.maximum(p * q - c * c, 1e-12 * p * q)
         x, y = (q * one - c * two) / det, (p * two - c * one) / det
         value = 0.5 * (one * x + two * y) - 0.5 * np.log(det / (first * second))
-        value = value + _log_half(self.sign[i][:, None, None], x * np.sqrt(det / q))
-        value = value + _log_half(self.sign[j][:, None, None], y * np.sqrt(det / p))
+        for k, mean, precision in ((i, x, det / q), (j, y, det / p)):
+            limits = self.low[k][:, None, None], self.high[k][:, None, None]
+            value = value + _log_within(*limits, mean, np.sqrt(precision))
         n = value.shape[1] * value.shape[2]
         value = logsumexp(value.reshape(len(i), n), axis=1) - np.log(n)
         return value + np.log(2 * self.prior[i] * self.prior[j])
@@ -240,9 +246,15 @@ class HarmonicSums(NamedTuple):
         return base + np.log(priors.EFFECT_COUNTS[0]), value
 
 
-def _log_half(sign: np.ndarray, standardised: np.ndarray) -> np.ndarray:
-    """ln of the posterior probability of a law's known sign over the prior one, ½; 0 if unknown."""
-    return np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * standardised))
+def _log_within(
+    low: np.ndarray, high: np.ndarray, mean: np.ndarray, root_precision: np.ndarray
+) -> np.ndarray:
+    """ln of the probability of N(mean, 1/root_precision²) between limits."""
+    lower, upper = (low - mean) * root_precision, (high - mean) * root_precision
+    flipped = lower > 0  # in the lower tail, where differences are exact
+    lower, upper = np.where(flipped, -upper, lower), np.where(flipped, -lower, upper)
+    below, above = log_ndtr(lower), log_ndtr(upper)
+    return above + np.log1p(-np.exp(below - above))
 
 
 def detectable_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.ndarray, " column"]:

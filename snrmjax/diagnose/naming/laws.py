@@ -64,6 +64,9 @@ _SLIPS = np.linspace(np.log(0.02), np.log(0.95), 47)  # ln, over the largest amp
 _EXPONENTS = np.linspace(1.1, 2.9, 10)
 _DETUNINGS = np.linspace(-0.04, 0.04, 9)
 _APART = np.array([-0.3, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.3])  # of a close mode, over ω₀
+_MOTION_GAINS = np.linspace(-0.24, 0.24, 8)  # at the largest amplitude
+_ITERATIONS = 40  # each of which reduces the error of such a gain by a factor of two or more
+_POWERS = 4  # of the amplitude, from 0
 _DAMPINGS = np.log([0.5, 2.0])  # ln, of a further mode, over the mode's own
 
 
@@ -78,6 +81,7 @@ class Law(NamedTuple):
     choices: tuple[float, ...] = ()  # discrete values of a last shape number, not refined
     sign: int = 0  # of the strength
     std: float | None = None  # 1σ of the strength; None: over `STRENGTHS`
+    unit: float | None = None  # shape at strength 1, where the change depends on the strength
     odds: float = 1.0  # over those of a law
     of_instrument: bool = False
     # Parameters of the effect in modal units, by readings, strength and shape.
@@ -189,9 +193,30 @@ def _relative(r: Readings) -> np.ndarray:
     return r.dynamic_stiffness / r.natural_frequency**2
 
 
-def _larger_motion(r: Readings) -> np.ndarray:
-    """Change where motions are recorded too large by a fraction: −(Z + dZ/d ln a)."""
-    return -(r.dynamic_stiffness + r.slope) / r.natural_frequency**2
+def _larger_motion(r: Readings, gain: float, power: int) -> np.ndarray:
+    """Change, over `gain`, where motions are recorded too large by g ∝ aᵖ of the true amplitude a.
+
+    `gain`: g of the largest state. The change of the model is exact, Zₘ(a)/(1 + g) − Zₘ(a(1 + g)).
+    What the readings have beyond it, H, changes by −g(H + dH/d ln a), with H as a polynomial of the
+    amplitude.
+    """
+    x = r.relative_amplitude
+    g = gain * np.ones_like(x)
+    for _ in range(_ITERATIONS if power else 0):
+        g = gain * (x * (1 + gain) / (1 + g)) ** power
+    known = r.model.at(0 * g)
+    of_model = r.model.at(-np.log1p(g)) / (1 + g) - known
+    beyond, weight = r.dynamic_stiffness - known - of_model, 1 / np.abs(r.dynamic_stiffness)
+    powers = np.arange(_POWERS)
+    terms = x[:, None] ** powers
+    fitted = np.linalg.lstsq(terms * weight[:, None], beyond * weight, rcond=None)[0]
+    return (of_model - g * (terms @ ((1 + powers) * fitted))) / (gain * r.natural_frequency**2)
+
+
+def _shape_change(r: Readings, strength: float, _: float) -> tuple[float]:
+    """Coefficient s, with s Q² the gain at the largest true amplitude Q."""
+    gain = strength * priors.GAIN
+    return (gain * ((1 + gain) / r.largest) ** 2,)
 
 
 def _forced(r: Readings, one: HarmonicReading, order: float) -> np.ndarray:
@@ -324,15 +349,19 @@ LAWS: dict[str, Law] = {
         **_OF_GAIN,
     ),
     SensorGainError.kind: Law(
-        lambda r: _larger_motion(r) * priors.GAIN,
-        parameters=lambda r, s: (s * priors.GAIN,),
+        lambda r, gain: _larger_motion(r, gain, 0) * priors.GAIN,
+        axes=(_MOTION_GAINS,),
+        unit=priors.GAIN,
+        parameters=lambda r, s, _: (s * priors.GAIN,),
         **_OF_GAIN,
     ),
     ModeShapeChange.kind: Law(
-        lambda r: _larger_motion(r) * priors.GAIN * r.relative_amplitude**2,
+        lambda r, gain: _larger_motion(r, gain, 2) * priors.GAIN,
+        axes=(_MOTION_GAINS,),
+        unit=priors.GAIN,
         std=1.0,
         odds=priors.INSTRUMENT,
-        parameters=lambda r, s: (s * priors.GAIN / r.largest**2,),
+        parameters=_shape_change,
     ),
     CloseMode.kind: Law(
         _close_mode,

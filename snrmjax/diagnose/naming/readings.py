@@ -21,6 +21,10 @@ from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.effect_metadata import MotionScales
 
 
+_AMPLITUDES = (-0.32, -0.16, 0.0, 0.16, 0.32)
+"""ln of amplitudes over the measured ones: gain errors from −27 to 38 %."""
+
+
 class ModelMotion(NamedTuple):
     """A model's prediction at a motion: as given, then with each stated parameter shifted by 1σ."""
 
@@ -30,6 +34,22 @@ class ModelMotion(NamedTuple):
 
 MotionOfModel = Callable[[Complex[np.ndarray, " state"], Float[np.ndarray, " state"]], ModelMotion]
 """Prediction for velocities (m/s) and frequencies (rad/s) of the mode alone."""
+
+
+class ModelByAmplitude(NamedTuple):
+    """The model's dynamic stiffness at other amplitudes than the measured ones."""
+
+    logs: Float[np.ndarray, " node"]  # ln of amplitude over measured amplitude
+    z: Complex[np.ndarray, "node state"]  # 1/s²
+
+    def at(self, log: Float[np.ndarray, " state"]) -> Complex[np.ndarray, " state"]:
+        """By Lagrange's polynomials; NaN beyond the nodes."""
+        z = np.zeros(self.z.shape[1], complex)
+        for node, value in zip(self.logs, self.z, strict=True):
+            others = self.logs[self.logs != node]
+            z += value * np.prod((log[:, None] - others) / (node - others), axis=1)
+        inside = (log >= self.logs[0]) & (log <= self.logs[-1])
+        return np.where(inside, z, np.nan)
 
 
 class RecordedHarmonics(NamedTuple):
@@ -79,6 +99,7 @@ class Readings(NamedTuple):
     order: Float[np.ndarray, " state"]  # position in the test, 0 to 1
     dynamic_stiffness: Complex[np.ndarray, " state"]  # Z, 1/s²
     slope: Complex[np.ndarray, " state"]  # dZ/d ln a of smooth curves
+    model: "ModelByAmplitude"
     root: Float[np.ndarray, "state 2 2"]  # whitening of real and imaginary part of Z
     beyond: Complex[np.ndarray, " state"]  # Z less that of the model, 1/s²
     rows: Float[np.ndarray, " row"]  # Z less that of the model, whitened
@@ -202,6 +223,7 @@ def readings_of(
         order,
         now.z,
         slope,
+        _model_by_amplitude(model, now.velocity, omega, known),
         root,
         rows,
         none,
@@ -214,6 +236,19 @@ def readings_of(
     return bare._replace(
         rows=bare.whitened(rows), errors=bare.whitened(np.array(columns)).T, harmonics=higher
     )
+
+
+def _model_by_amplitude(
+    model: MotionOfModel,
+    velocity: Complex[np.ndarray, " state"],
+    omega: Float[np.ndarray, " state"],
+    known: Complex[np.ndarray, " state"],
+) -> ModelByAmplitude:
+    """The model at smaller and larger motions, as far as it has them; `known`: at the measured."""
+    logs = np.array(_AMPLITUDES)
+    z = [known if u == 0 else model(velocity * np.exp(u), omega).dynamic_stiffness[0] for u in logs]
+    there = np.isfinite(z).all(axis=1)
+    return ModelByAmplitude(logs[there], np.array(z)[there])
 
 
 def _higher(

@@ -2,14 +2,24 @@
 
 import numpy as np
 import pytest
-from truths.phased_states import OMEGA, RATIO, linear_motion, named, nothing, readings, states_of
+from truths.phased_states import (
+    OMEGA,
+    RATIO,
+    SHAPE,
+    dynamic,
+    linear_motion,
+    named,
+    nothing,
+    readings,
+    states_of,
+)
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming import hypotheses, parts
 from snrmjax.diagnose.naming.columns import hypothesis_columns
 from snrmjax.diagnose.naming.evidence import remainder_stds
 from snrmjax.diagnose.naming.hypotheses import hypotheses_of
-from snrmjax.diagnose.naming.readings import readings_of
+from snrmjax.diagnose.naming.readings import ModelMotion, readings_of
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.naming.rows import Cell, problem_of, solved
 from snrmjax.model.effects import EFFECTS
@@ -41,6 +51,30 @@ def test_an_evidence_is_that_of_the_dense_gaussian():
     wanted += np.log(priors.EFFECT_COUNTS[1] / len(LAWS)) - np.log(priors.EFFECT_COUNTS[0])
     found = cells[0,].log_evidence - cells[()].log_evidence
     assert found == pytest.approx(wanted, abs=1e-4)
+
+
+def test_an_evidence_counts_strengths_between_limits():
+    """Against quadrature of the dense density over the strength, for each interval of a gain."""
+    read = readings(lambda x: 3e-4 * x**2, nothing)
+    problem = problem_of(read, hypothesis_columns(read, ["sensor_gain_error"]), 1.0)
+    stds = (0.0, 0.0)
+    cells = {
+        c.columns: c for c in hypotheses._compared(problem, reach=1e6)[0] if c.remainder_std == stds
+    }
+    (block,) = problem.blocks
+    base = block.design * np.sqrt(block.variances(stds))
+    factor = np.linalg.cholesky(np.eye(len(read.rows)) + base @ base.T)
+    for k, column in enumerate(problem.columns):
+        strength = np.linspace(*column.limits, 100001)
+        left = read.rows[:, None] - block.laws[:, [k]] * strength
+        density = -0.5 * np.sum(np.linalg.solve(factor, left) ** 2, axis=0) - 0.5 * strength**2
+        density[[0, -1]] -= np.log(2)  # the trapezoidal rule
+        step = (strength[1] - strength[0]) / np.sqrt(2 * np.pi)
+        wanted = np.logaddexp.reduce(density) + np.log(step)
+        wanted += 0.5 * np.sum(np.linalg.solve(factor, read.rows) ** 2)
+        wanted += np.log(priors.EFFECT_COUNTS[1]) - np.log(priors.EFFECT_COUNTS[0])
+        found = cells[k,].log_evidence - cells[()].log_evidence
+        assert found == pytest.approx(wanted, abs=2e-3)
 
 
 def test_strengths_are_those_of_least_squares_where_nothing_else_is_unknown():
@@ -155,6 +189,38 @@ def test_states_are_drawn_without_the_error_of_an_instrument():
     x = part.remainder.velocity / part.remainder.velocity[-1]
     at_states = np.interp(read.relative_amplitude, x, part.remainder.laws)
     np.testing.assert_allclose(at_states, wanted, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "power", "gain"),
+    [
+        ("sensor_gain_error", 0, 0.13),
+        ("sensor_gain_error", 0, -0.13),
+        ("mode_shape_change", 2, 0.15),
+        ("mode_shape_change", 2, -0.12),
+    ],
+)
+def test_a_large_gain_of_motions_is_found_by_the_known_stiffness(kind, power, gain):
+    """Recorded amplitudes are (1 + g xᵖ) times true ones; the model is an exact cubic spring."""
+    states = states_of(lambda x: 0.3 * x**2, nothing)
+    amplitude = np.abs(states.velocity) / states.frequency
+    largest = np.max(amplitude)
+
+    def motion(velocity, omega):
+        x = np.abs(velocity) / omega / largest
+        z = dynamic(omega) + 0.3 * x**2 * OMEGA**2
+        return ModelMotion(z[None], np.zeros((1, len(omega), 2), complex))
+
+    factor = 1 + gain * (amplitude / largest) ** power
+    recorded = states._replace(velocity=states.velocity * factor)
+    linear = readings(nothing, nothing).linear
+    read = readings_of(recorded, np.zeros(len(factor)), motion, linear)
+    found = parts.naming_of(*hypotheses.best_hypotheses(read, EFFECTS))
+    assert found.candidates == ((kind,),)
+    strength = next(iter(found.parameters.values()))
+    wanted = gain if power == 0 else gain / (largest / SHAPE) ** 2
+    assert strength.value == pytest.approx(wanted, abs=3 * strength.std)
+    assert strength.std < 0.1 * abs(wanted)
 
 
 def test_readings_do_not_change_with_units_of_force():
