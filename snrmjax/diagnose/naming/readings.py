@@ -20,7 +20,6 @@ from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.effect_metadata import MotionScales
 
-
 _AMPLITUDES = (-0.32, -0.16, 0.0, 0.16, 0.32)
 """ln of amplitudes over the measured ones: gain errors from −27 to 38 %."""
 
