@@ -275,9 +275,8 @@ def whitening(
 ) -> tuple[Float[np.ndarray, "state 2 2"], float]:
     """Inverse Cholesky factors of every state's 2×2 covariance, and the sum of log determinants."""
     scaled = slopes * std / np.sqrt(weight)[:, None]
-    a = np.sum(scaled.real**2, axis=1)
-    b = np.sum(scaled.real * scaled.imag, axis=1)
-    c = np.sum(scaled.imag**2, axis=1)
+    real, imag = scaled.real, scaled.imag
+    a, b, c = ((x * y).sum(axis=1) for x, y in ((real, real), (real, imag), (imag, imag)))
     floor = 1e-12 * (a + c)  # keeps it regular in floating point
     a = a + floor
     det = np.maximum(a * c - b**2, floor * a)

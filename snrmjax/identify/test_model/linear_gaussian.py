@@ -84,11 +84,12 @@ class LinearRows(NamedTuple):
             return -0.5 * (constant + square) + self.offset, square - n, np.zeros(len(variance))
         scale = scale / np.sqrt(self.fraction)
         covariance = by_root @ by_root.T
-        covariance[np.diag_indices(m)] += scale**2
+        diagonal = covariance.reshape(-1)[:: m + 1]  # a view
+        diagonal += scale**2
         # Scaled to a unit diagonal, for conditioning.
-        unit = 1 / np.sqrt(np.diagonal(covariance))
+        unit = 1 / np.sqrt(diagonal)
         covariance *= unit[:, None] * unit
-        covariance[np.diag_indices(m)] += _ROUNDING
+        diagonal += _ROUNDING
         factor, failed = dpotrf(covariance.T, lower=True, clean=False, overwrite_a=True)
         if failed:
             raise np.linalg.LinAlgError("the matrix is not positive definite.")
@@ -101,7 +102,7 @@ class LinearRows(NamedTuple):
             "ij,ij->j", sensitivities, sensitivities
         )  # information of the rows on every unknown; sums to m less the noise's part
         weighed = dtrtrs(factor, along, lower=True, trans=1)[0] * unit
-        log_det = 2 * float(np.sum(np.log(np.diagonal(factor) / unit)))
+        log_det = 2 * float(np.log(factor.diagonal() / unit).sum())
         square = float(along @ along) + self.across / scale**2
         value = -0.5 * (constant - m * np.log(scale**2) + log_det + square)
         by_scale = scale**2 * float(weighed @ weighed) + self.across / scale**2

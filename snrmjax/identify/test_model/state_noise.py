@@ -57,6 +57,7 @@ def noise_of_states(
     base = noise * states.errors[:, :RECORDED]
     floor = 1 / np.abs(states.velocity)  # of 1 m/s
 
+    std = np.empty((len(base), RECORDED + 1))
     typical = noise * np.median(np.abs(states.velocity))
 
     def parts(point: np.ndarray, kinds: tuple[bool, bool]) -> np.ndarray:
@@ -67,7 +68,7 @@ def noise_of_states(
 
     def criterion(point: np.ndarray, kinds: tuple[bool, bool]) -> float:
         own, scatter, second = parts(point, kinds)
-        std = np.column_stack([own * base, np.full(len(base), scatter)])
+        std[:, :RECORDED], std[:, RECORDED] = own * base, scatter
         std[:, 1:RECORDED] = np.hypot(std[:, 1:RECORDED], (second * floor)[:, None])
         root, log_det = whitening(slopes, std, balance.weight)
         white = np.einsum("nij,nj->ni", root, residual_parts)

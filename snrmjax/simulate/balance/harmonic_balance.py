@@ -19,7 +19,7 @@ from snrmjax.model.elements import ForceGroup, elements_of
 from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, linear_terms_of
-from snrmjax.numerics.compiled import as_numpy, compiled
+from snrmjax.numerics.compiled import as_numpy, compiled, jitted
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonics import (
     alias_free_samples,
@@ -105,13 +105,13 @@ class HarmonicBalance(eqx.Module):
 
     def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
         """R(x, λ): force balance of every coefficient over ω²·displacement scale."""
-        return self._balance(point, with_jacobian=False)[0]
+        return _balanced(self, point, with_jacobian=False)[0]
 
     def linearised(
         self, point: Float[Array, " unknown"]
     ) -> tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]:
         """R(x, λ) and its Jacobian with respect to (x, λ), the last column for λ."""
-        return self._balance(point, with_jacobian=True)
+        return _balanced(self, point, with_jacobian=True)
 
     def _balance(self, point: Array, *, with_jacobian: bool) -> tuple[Array, Array]:
         model, fs = self.model, self.frequency_scale
@@ -191,6 +191,16 @@ class HarmonicBalance(eqx.Module):
             blocks = blocks + jnp.einsum("cdfij,fim,fjn->cdmn", local, influence, influence)
             change = change + elements.summed(group, values / unit)
         return blocks, elements.on_modes(jnp.asarray(basis.analysis) @ change)
+
+
+@jitted
+def _balanced(balance: HarmonicBalance, point: Array, *, with_jacobian: bool) -> tuple:
+    """`HarmonicBalance._balance`, traced once for all programs that solve it.
+
+    Each step of Newton's method has it twice, each curve several programs: tracing took longer
+    than compiling.
+    """
+    return balance._balance(point, with_jacobian=with_jacobian)
 
 
 def _across(
