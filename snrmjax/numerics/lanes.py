@@ -107,6 +107,7 @@ def iterated(
 
     alone, states = len(states) == 1, jax.vmap(unravel)(states)
 
+    @jax.jit  # traced once, for the shapes of its rows and for the loop
     def stepped(states: States) -> tuple[States, tuple]:
         if not alone:
             return jax.vmap(step)(jobs, states)

@@ -93,7 +93,7 @@ class CurveBasis(NamedTuple):
     ) -> tuple[Float[np.ndarray, "curve point"], Float[np.ndarray, "curve point"]]:
         """Curves of these coefficients, and their derivatives by the logarithm of amplitude."""
         u = (amplitude / self.largest) ** 2
-        k = np.clip(np.searchsorted(self.knots, u, side="right") - 1, 0, len(self.knots) - 2)
+        k = np.searchsorted(self.knots[1:-1], u, side="right")
         inside = np.minimum(u, self.knots[-1])
         t = (inside - self.knots[k])[:, None]
         third, second, first, value = (self.pieces @ coefficients)[:, k]

@@ -90,7 +90,7 @@ class JointDensity(NamedTuple):
         off = point[self.half] - self.scale
         square = np.exp(2 * off)
         slopes[self.normal], slopes[self.half] = -step / self.std, 1 - square
-        value = -0.5 * float(step @ step) + float(np.sum(off) - 0.5 * np.sum(square))
+        value = -0.5 * float(step @ step) + float(off.sum() - 0.5 * square.sum())
         return value + self.constant, slopes
 
 
