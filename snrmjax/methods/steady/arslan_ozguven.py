@@ -21,6 +21,8 @@ from snrmjax.model.modes import (
     reference_sensor,
 )
 
+_STEP = 1e-6  # of the finite differences, relative or rad
+
 
 def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:
     """Natural frequency and damping that the describing function at each state implies.
@@ -36,7 +38,10 @@ def arslan_ozguven(data: SteadyStates, modes: LinearModes) -> MethodResult:
     Validity: the element is at the reference sensor; errors of the linear model enter in full.
     """
     states = sensor_states(data, modes)
-    points = [_point(states, k, modes) for k in range(len(states.level))]
+    factors = (1.0, 1 + _STEP, np.exp(1j * _STEP))
+    moved = (states._replace(velocity=states.velocity * factor) for factor in factors)
+    functions = np.stack([describing_function(one, modes) for one in moved], axis=1)
+    points = [_point(states, k, of_state, modes) for k, of_state in enumerate(functions)]
     return method_result("arslan_ozguven", points, len(states.level))
 
 
@@ -56,20 +61,24 @@ def describing_function(states: SensorStates, modes: LinearModes) -> Complex[np.
     return (driven * states.force - states.displacement) / (direct * states.displacement)
 
 
-def _point(states: SensorStates, k: int, modes: LinearModes) -> MethodPoint:
-    """The mode that one state implies, with 1σ by finite differences of amplitude and phase."""
+def _point(
+    states: SensorStates,
+    k: int,
+    functions: Complex[np.ndarray, " factor"],
+    modes: LinearModes,
+) -> MethodPoint:
+    """The mode that one state implies, with 1σ by finite differences of amplitude and phase.
+
+    Arguments: its describing `functions` as measured, and with these two changed.
+    """
     state = states.of(np.array([k]))
-    mode = _mode_of(state, modes)
+    mode, *others = (_mode_of(v, float(state.frequency[0]), modes) for v in functions.tolist())
     if mode is None:
         return MethodPoint(MethodStatus.NOT_A_MODE, int(state.level[0]))
     natural, ratio = mode
-    step = 1e-6
-    derivatives = []
-    for factor in (1 + step, np.exp(1j * step)):
-        response = _mode_of(state._replace(velocity=state.velocity * factor), modes)
-        derivatives.append(
-            np.nan * np.zeros(2) if response is None else (np.array(response) - mode) / step
-        )
+    derivatives = [
+        np.nan * np.zeros(2) if one is None else (np.array(one) - mode) / _STEP for one in others
+    ]
     std = np.hypot(derivatives[0] * state.amplitude_std, derivatives[1] * state.phase_std)
     return MethodPoint(
         MethodStatus.FOUND,
@@ -97,23 +106,22 @@ def _eigenvalue_of(
     return (float(abs(value)), float(-value.real / abs(value))) if value.real < 0 else None
 
 
-def _mode_of(state: SensorStates, modes: LinearModes) -> tuple[float, float] | None:
-    """ω̃ and ζ̃ of the mode of interest with the element of one state; None where not positive."""
-    v = complex(describing_function(state, modes)[0])
+def _mode_of(v: complex, frequency: float, modes: LinearModes) -> tuple[float, float] | None:
+    """ω̃ and ζ̃ of the mode of interest with an element v at Ω; None where not positive."""
     shape = np.asarray(modes.mode_shape)[reference_sensor(modes)]
     natural = np.asarray(modes.natural_frequency)
     stiffness = np.diag(natural**2) + v.real * np.outer(shape, shape)
     if modes.damping_coupling is not None:
         linear_damping = np.diag(2 * np.asarray(modes.damping_ratio) * natural)
-        rate = v.imag / float(state.frequency[0])
+        rate = v.imag / frequency
         damped = linear_damping + np.asarray(modes.damping_coupling) + rate * np.outer(shape, shape)
         return _eigenvalue_of(stiffness, damped, modes.mode_of_interest)
     squares, vectors = np.linalg.eigh(stiffness)
     k = int(np.argmax(np.abs(vectors[modes.mode_of_interest])))
     mode = vectors[:, k]
-    added = v.imag / float(state.frequency[0]) * float(shape @ mode) ** 2
+    added = v.imag / frequency * float(shape @ mode) ** 2
     damping = float(mode**2 @ (2 * np.asarray(modes.damping_ratio) * natural)) + added
     if not (squares[k] > 0 and damping > 0):
         return None
-    frequency = float(np.sqrt(squares[k]))
-    return frequency, damping / (2 * frequency)
+    own = float(np.sqrt(squares[k]))
+    return own, damping / (2 * own)
