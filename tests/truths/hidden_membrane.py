@@ -59,7 +59,10 @@ class HiddenMembrane(NamedTuple):
             tangent[:n, :n] += 6 * np.einsum("ijk,k->ij", self.cubic, q)
             tangent[:n, :n] += 12 * np.einsum("ijkl,k,l->ij", self.quartic, q, q)
             tangent[n:, :n], tangent[:n, n:] = slope, slope.T
-            x = x - np.linalg.solve(tangent, rest)
+            step = np.linalg.solve(tangent, rest)
+            x, near = x - step, np.abs(step).max() < 1e-9 * np.abs(x).max()
+            if near:  # to rounding, as each step squares the error
+                break
         q, w = x[:n], x[n:]
         energy = 0.5 * squared @ q**2 + 0.5 * self.stiffness @ w**2
         energy += w @ np.einsum("jmn,m,n->j", self.forms, q, q)
