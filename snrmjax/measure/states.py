@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.model.moving_base import BaseMotion
-from snrmjax.numerics.compiled import value_of
+from snrmjax.numerics.compiled import as_numpy, value_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.rules import InputError
@@ -140,7 +140,9 @@ class SteadyStates(AbstractResult):
 
     def select(self, rows: Bool[np.ndarray, " state"] | Int[np.ndarray, " row"]) -> "SteadyStates":
         """Some of the states, by a mask or by row numbers in the given order."""
-        return jax.tree.map(lambda column: column[np.asarray(rows)], self)
+        index = np.asarray(rows)
+        # On the host, where possible: on the device every number of rows would compile.
+        return jax.tree.map(lambda column: jnp.asarray(as_numpy(column)[index]), self)
 
     def renumbered(self, offset: int) -> "SteadyStates":
         """The same states with `offset` added to their levels, for joining tests."""

@@ -89,7 +89,8 @@ def predicted_test(
     rows = tuple(member_of[valid] == number for number in range(len(points)))
     phases = np.angle(np.asarray(predicted.velocity)[:, sensor])
     at_resonance = []
-    for column in (predicted.force, predicted.frequency):  # at zero phase
+    # At zero phase; on the host, as on the device every number of states would compile.
+    for column in map(np.asarray, (predicted.force, predicted.frequency)):
         own = []
         for mine in rows:
             order = np.flatnonzero(mine)[np.argsort(phases[mine])]
