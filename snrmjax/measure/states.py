@@ -320,7 +320,15 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
     notes = tuple(dict.fromkeys(note for test in tests for note in test.notes))
     orders = tuple(sorted({order for test in tests for order in test.harmonic_order}))
     alike = [dataclasses.replace(_with_harmonics(test, orders), notes=notes) for test in tests]
-    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *alike)
+    return jax.tree.map(_joined, *alike)
+
+
+def _joined(*columns: Array) -> Array:
+    """One after the other, on the host where possible: on the device other lengths compile."""
+    hosted = list(map(as_numpy, columns))
+    if any(isinstance(column, jax.core.Tracer) for column in hosted):
+        return jnp.concatenate(hosted)
+    return jnp.asarray(np.concatenate(hosted))
 
 
 def with_levels_apart(tests: Iterable[SteadyStates]) -> tuple[SteadyStates, ...]:
