@@ -195,11 +195,11 @@ class TestStd:
         at = np.linspace(0.2, 1.0, 9)
         one = backbone(values, np.eye(6))
 
-        def knots(backbone):
+        def at_knots(backbone):
             return backbone.squared_frequency.parameters, backbone.modal_damping.parameters
 
         draws = (values + root @ rng.normal(size=6) for _ in range(2000))
-        drawn = [eqx.tree_at(knots, one, tuple(np.split(v, 2))).values(at) for v in draws]
+        drawn = [eqx.tree_at(at_knots, one, tuple(np.split(v, 2))).values(at) for v in draws]
         identification = backbone(values, root @ root.T)
         values = identification.values(at)
         # 2000 draws know a standard deviation to 1.6 %. Both curves err together here.
