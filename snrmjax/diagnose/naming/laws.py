@@ -95,6 +95,11 @@ def _stiffness(power: int) -> Change:
     return lambda r: r.relative_amplitude**power + 0j
 
 
+def _same_ratio(r: Readings) -> np.ndarray:
+    """Of a stiffness with the damping ratio unchanged: 2iζω₀Ω changes by half its fraction."""
+    return 1 + 1j * r.damping_ratio * r.relative_frequency
+
+
 def _damping(power: int, frequency_power: int) -> Change:
     """Damping by a force ∝ a^(power + 1) Ω^frequency_power."""
     return lambda r: 1j * r.relative_amplitude**power * r.relative_frequency**frequency_power
@@ -228,7 +233,7 @@ _OF_GAIN: dict[str, Any] = {"std": 1.0, **_INSTRUMENT}
 
 LAWS: dict[str, Law] = {
     LinearFrequencyShift.kind: Law(
-        _stiffness(0), parameters=lambda r, s: (float(np.sqrt(max(1 + s, 0.0))) - 1,)
+        _same_ratio, parameters=lambda r, s: (float(np.sqrt(max(1 + s, 0.0))) - 1,)
     ),
     CubicStiffness.kind: Law(
         _stiffness(2),
@@ -389,7 +394,7 @@ LAWS: dict[str, Law] = {
         **_OF_GAIN,
     ),
     FrequencyDrift.kind: Law(
-        lambda r: 2 * r.order * priors.DRIFT + 0j,
+        lambda r: 2 * r.order * priors.DRIFT * _same_ratio(r),
         parameters=lambda r, s: (s * priors.DRIFT,),
         **_OF_GAIN,
     ),

@@ -223,6 +223,24 @@ def test_a_large_gain_of_motions_is_found_by_the_known_stiffness(kind, power, ga
     assert strength.std < 0.1 * abs(wanted)
 
 
+@pytest.mark.parametrize(
+    ("kind", "strength", "exact"),
+    [
+        ("linear_frequency_shift", 1.01**2 - 1, lambda om: (1.01**2 - 1, 1.01 - 1, 0.0)),
+        ("added_mass", 0.01 / priors.ADDED_MASS, lambda om: (-(om**2) * 0.01, 0.0, 0.0)),
+        ("linear_damping_change", 0.002, lambda om: (0.0, 0.0, 0.002)),
+    ],
+)
+def test_a_change_of_the_linear_mode_is_that_of_its_equation_of_motion(kind, strength, exact):
+    """Z/ω₀² = (1 + s)² − Ω²(1 + m) + 2iζ(1 + s)Ω + icΩ."""
+    read = readings(nothing, nothing)
+    (column,) = hypothesis_columns(read, [kind])
+    omega = read.relative_frequency
+    stiffness, damping, further = exact(omega)
+    wanted = stiffness + 1j * omega * (2 * RATIO * damping + further)
+    np.testing.assert_allclose(strength * column.change * column.scale, wanted, rtol=6e-3)
+
+
 def test_readings_do_not_change_with_units_of_force():
     """A force in other units with the modal constant in theirs is the same test."""
     states = states_of(lambda x: 0.02 * x**2, nothing)
