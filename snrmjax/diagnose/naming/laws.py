@@ -198,24 +198,60 @@ def _relative(r: Readings) -> np.ndarray:
     return r.dynamic_stiffness / r.natural_frequency**2
 
 
-def _larger_motion(r: Readings, gain: float, power: int) -> np.ndarray:
-    """Change, over `gain`, where motions are recorded too large by g ∝ aᵖ of the true amplitude a.
+def _larger_motion(power: int) -> Change:
+    """Change where motions are recorded too large by g ∝ aᵖ of the true amplitude a.
 
-    `gain`: g of the largest state. The change of the model is exact, Zₘ(a)/(1 + g) − Zₘ(a(1 + g)).
-    What the readings have beyond it, H, changes by −g(H + dH/d ln a), with H as a polynomial of the
-    amplitude.
+    Arguments: `power`: p. The change of the model is exact, Zₘ(a)/(1 + g) − Zₘ(a(1 + g)). What the
+    readings have beyond it, H, changes by −g(H + dH/d ln a).
     """
-    x = r.relative_amplitude
-    g = gain * np.ones_like(x)
+
+    def change(r: Readings, gain: float) -> np.ndarray:
+        g = _gains(r, gain, power)
+        known = r.model.at(0 * g)
+        of_model = r.model.at(-np.log1p(g)) / (1 + g) - known
+        beyond, weight = r.dynamic_stiffness - known - of_model, np.sqrt(np.linalg.det(r.root))
+        value, slope = _smooth(r.relative_amplitude, beyond, weight)
+        return _per_gain(r, of_model - g * (value + slope), gain)
+
+    return change
+
+
+def _harmonics_of_larger_motion(power: int) -> Change:
+    """Likewise of cₕ/x, whose harmonics have the same gain: −g dH/d ln a beyond the model."""
+
+    def higher(r: Readings, one: HarmonicReading, gain: float) -> np.ndarray:
+        g = _gains(r, gain, power)
+        of_model = one.model.at(-np.log1p(g)) - one.model.at(0 * g)
+        _, slope = _smooth(r.relative_amplitude, one.beyond - of_model, one.weight)
+        return _per_gain(r, of_model - g * slope, gain)
+
+    return higher
+
+
+def _gains(r: Readings, gain: float, power: int) -> np.ndarray:
+    """Gain g ∝ aᵖ of every state, with `gain` at the largest one; a: true amplitude."""
+    g = gain * np.ones_like(r.relative_amplitude)
     for _ in range(_ITERATIONS if power else 0):
-        g = gain * (x * (1 + gain) / (1 + g)) ** power
-    known = r.model.at(0 * g)
-    of_model = r.model.at(-np.log1p(g)) / (1 + g) - known
-    beyond, weight = r.dynamic_stiffness - known - of_model, 1 / np.abs(r.dynamic_stiffness)
+        g = gain * (r.relative_amplitude * (1 + gain) / (1 + g)) ** power
+    return g
+
+
+def _smooth(x: np.ndarray, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values as a polynomial of the amplitude, and its derivative by ln of the amplitude.
+
+    Shrunk as far as it may be noise: James and Stein, Proc. 4th Berkeley Symp. 1 (1961) 361.
+    `weight`: 1 over the 1σ of real and imaginary parts.
+    """
     powers = np.arange(_POWERS)
     terms = x[:, None] ** powers
-    fitted = np.linalg.lstsq(terms * weight[:, None], beyond * weight, rcond=None)[0]
-    return (of_model - g * (terms @ ((1 + powers) * fitted))) / (gain * r.natural_frequency**2)
+    fitted = np.linalg.lstsq(terms * weight[:, None], values * weight, rcond=None)[0]
+    explained = np.sum(np.abs(terms @ fitted * weight) ** 2)
+    fitted = fitted * max(0.0, 1 - 2 * _POWERS / max(explained, 1e-300))
+    return terms @ fitted, terms @ (powers * fitted)
+
+
+def _per_gain(r: Readings, change: np.ndarray, gain: float) -> np.ndarray:
+    return change * priors.GAIN / (gain * r.natural_frequency**2)
 
 
 def _shape_change(r: Readings, strength: float, _: float) -> tuple[float]:
@@ -354,14 +390,16 @@ LAWS: dict[str, Law] = {
         **_OF_GAIN,
     ),
     SensorGainError.kind: Law(
-        lambda r, gain: _larger_motion(r, gain, 0) * priors.GAIN,
+        _larger_motion(0),
+        _harmonics_of_larger_motion(0),
         axes=(_MOTION_GAINS,),
         unit=priors.GAIN,
         parameters=lambda r, s, _: (s * priors.GAIN,),
         **_OF_GAIN,
     ),
     ModeShapeChange.kind: Law(
-        lambda r, gain: _larger_motion(r, gain, 2) * priors.GAIN,
+        _larger_motion(2),
+        _harmonics_of_larger_motion(2),
         axes=(_MOTION_GAINS,),
         unit=priors.GAIN,
         std=1.0,

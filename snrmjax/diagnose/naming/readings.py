@@ -35,22 +35,6 @@ MotionOfModel = Callable[[Complex[np.ndarray, " state"], Float[np.ndarray, " sta
 """Prediction for velocities (m/s) and frequencies (rad/s) of the mode alone."""
 
 
-class ModelByAmplitude(NamedTuple):
-    """The model's dynamic stiffness at other amplitudes than the measured ones."""
-
-    logs: Float[np.ndarray, " node"]  # ln of amplitude over measured amplitude
-    z: Complex[np.ndarray, "node state"]  # 1/s²
-
-    def at(self, log: Float[np.ndarray, " state"]) -> Complex[np.ndarray, " state"]:
-        """By Lagrange's polynomials; NaN beyond the nodes."""
-        z = np.zeros(self.z.shape[1], complex)
-        for node, value in zip(self.logs, self.z, strict=True):
-            others = self.logs[self.logs != node]
-            z += value * np.prod((log[:, None] - others) / (node - others), axis=1)
-        inside = (log >= self.logs[0]) & (log <= self.logs[-1])
-        return np.where(inside, z, np.nan)
-
-
 class RecordedHarmonics(NamedTuple):
     """Other harmonics recorded at the reference sensor."""
 
@@ -58,6 +42,22 @@ class RecordedHarmonics(NamedTuple):
     velocity: Complex[np.ndarray, "state order"]  # m/s
     std: Float[np.ndarray, "state order"]  # 1σ of each part, m/s; NaN where not recorded
     forced: Complex[np.ndarray, "state order"]  # m/s, by an exciter harmonic as large as the force
+
+
+class ModelByAmplitude(NamedTuple):
+    """A quantity of the model at other amplitudes than the measured ones."""
+
+    logs: Float[np.ndarray, " node"]  # ln of amplitude over measured amplitude
+    value: Complex[np.ndarray, "node state"]
+
+    def at(self, log: Float[np.ndarray, " state"]) -> Complex[np.ndarray, " state"]:
+        """By Lagrange's polynomials; NaN beyond the nodes."""
+        whole = np.zeros(self.value.shape[1], complex)
+        for node, value in zip(self.logs, self.value, strict=True):
+            others = self.logs[self.logs != node]
+            whole += value * np.prod((log[:, None] - others) / (node - others), axis=1)
+        inside = (log >= self.logs[0]) & (log <= self.logs[-1])
+        return np.where(inside, whole, np.nan)
 
 
 class HarmonicReading(NamedTuple):
@@ -68,6 +68,7 @@ class HarmonicReading(NamedTuple):
     weight: Float[np.ndarray, " state"]  # 1 over the 1σ of each part; 0 where not recorded
     forced: Complex[np.ndarray, " state"]  # by an exciter harmonic as large as the force
     errors: Complex[np.ndarray, "error state"]  # by 1σ of each of the model's parameters
+    model: ModelByAmplitude  # cₕ/x of the model, 1/s²
 
     def whitened(self, change: Complex[np.ndarray, "*several state"]) -> np.ndarray:
         """Changes (1/s²) whitened to rows, (…, row)."""
@@ -98,7 +99,7 @@ class Readings(NamedTuple):
     order: Float[np.ndarray, " state"]  # position in the test, 0 to 1
     dynamic_stiffness: Complex[np.ndarray, " state"]  # Z, 1/s²
     slope: Complex[np.ndarray, " state"]  # dZ/d ln a of smooth curves
-    model: "ModelByAmplitude"
+    model: ModelByAmplitude  # Z of the model, 1/s²
     root: Float[np.ndarray, "state 2 2"]  # whitening of real and imaginary part of Z
     beyond: Complex[np.ndarray, " state"]  # Z less that of the model, 1/s²
     rows: Float[np.ndarray, " row"]  # Z less that of the model, whitened
@@ -193,6 +194,7 @@ def readings_of(
     # Measured less model Z, linearised about the corrected motion.
     motion = model(now.velocity, omega)
     known, *shifted = motion.dynamic_stiffness
+    logs, others = _at_other_amplitudes(model, motion, now.velocity, omega)
     rows = now.z - known - np.sum(slopes * posterior.corrections, axis=1)
     rows = rows - 1j * now.z * posterior.mean[PHASE]
     of_gain = now.z if states.force_is_free else -now.z - now.slope
@@ -222,7 +224,7 @@ def readings_of(
         order,
         now.z,
         slope,
-        _model_by_amplitude(model, now.velocity, omega, known),
+        ModelByAmplitude(logs, np.array([one.dynamic_stiffness[0] for one in others])),
         root,
         rows,
         none,
@@ -231,23 +233,25 @@ def readings_of(
         level_stds,
         posterior=posterior,
     )
-    higher = () if recorded is None else _higher(linear, states, now.velocity, motion, recorded)
+    higher: tuple[HarmonicReading, ...] = ()
+    if recorded is not None:
+        higher = _higher(linear, states, now.velocity, motion, recorded, logs, others)
     return bare._replace(
         rows=bare.whitened(rows), errors=bare.whitened(np.array(columns)).T, harmonics=higher
     )
 
 
-def _model_by_amplitude(
+def _at_other_amplitudes(
     model: MotionOfModel,
+    measured: ModelMotion,
     velocity: Complex[np.ndarray, " state"],
     omega: Float[np.ndarray, " state"],
-    known: Complex[np.ndarray, " state"],
-) -> ModelByAmplitude:
-    """The model at smaller and larger motions, as far as it has them; `known`: at the measured."""
-    logs = np.array(_AMPLITUDES)
-    z = [known if u == 0 else model(velocity * np.exp(u), omega).dynamic_stiffness[0] for u in logs]
-    there = np.isfinite(z).all(axis=1)
-    return ModelByAmplitude(logs[there], np.array(z)[there])
+) -> tuple[np.ndarray, list[ModelMotion]]:
+    """ln of amplitudes over the measured ones, and the model's motions, as far as it has them."""
+    motions = [measured if u == 0 else model(velocity * np.exp(u), omega) for u in _AMPLITUDES]
+    there = [np.isfinite(one.dynamic_stiffness[0]).all() for one in motions]
+    logs = np.array(_AMPLITUDES)[there]
+    return logs, [one for one, exists in zip(motions, there, strict=True) if exists]
 
 
 def _higher(
@@ -256,6 +260,8 @@ def _higher(
     velocity: Complex[np.ndarray, " state"],
     motion: ModelMotion,
     recorded: RecordedHarmonics,
+    logs: Float[np.ndarray, " node"],
+    others: list[ModelMotion],
 ) -> tuple[HarmonicReading, ...]:
     """Harmonics of the force from those of the motion, by the linear mode's dynamic stiffness.
 
@@ -277,5 +283,9 @@ def _higher(
         forced = unit * recorded.forced[:, index]
         errors = np.array([one - model for one in shifted]).reshape(-1, len(omega))
         beyond = np.where(there, beyond, 0.0)
-        readings.append(HarmonicReading(order, beyond, weight, forced, errors))
+        by_log = [
+            one.harmonics[0, :, index] * np.exp(-u) for u, one in zip(logs, others, strict=True)
+        ]
+        by_amplitude = ModelByAmplitude(logs, unit * np.array(by_log))
+        readings.append(HarmonicReading(order, beyond, weight, forced, errors, by_amplitude))
     return tuple(readings)
