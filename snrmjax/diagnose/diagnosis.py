@@ -42,6 +42,7 @@ from snrmjax.diagnose.diagnosis_result import (
 )
 from snrmjax.diagnose.explained_parts import named_parts
 from snrmjax.diagnose.fitted_effects import FittedEffects
+from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference
 from snrmjax.diagnose.misfit.locating import Located, locate_misfit
 from snrmjax.diagnose.misfit.noise_model import notes_without_phases, unit_columns
@@ -248,11 +249,11 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
     """Kinds of effects excluded from the search."""
     excluded = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # a free gain already covers gain and mass errors
-        excluded |= {kind for kind, effect in EFFECTS.items() if effect.like_force_gain}
+        excluded |= {kind for kind in EFFECTS if hypothesis_of(kind).like_force_gain}
     if force_gain_std > priors.LOOSE_GAIN:
-        excluded |= {kind for kind, effect in EFFECTS.items() if effect.follows_force}
+        excluded |= {kind for kind in EFFECTS if hypothesis_of(kind).follows_force}
     if not phases:
-        excluded |= {kind for kind, effect in EFFECTS.items() if effect.only_phase}
+        excluded |= {kind for kind in EFFECTS if hypothesis_of(kind).only_phase}
     return excluded
 
 

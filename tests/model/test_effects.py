@@ -98,14 +98,6 @@ def test_parameters_in_order_and_as_arrays(kind):
 
 
 @pytest.mark.parametrize("kind", FAMILY)
-def test_an_effect_without_strength_stays_at_its_place(kind):
-    effect = make_effect(kind, FAMILY[kind][0], at="tip")
-    idle = effect.idle(100.0, 0.01)
-    assert (type(idle), idle.at) == (type(effect), effect.at)
-    assert float(idle.force(*map(jnp.asarray, STATES[0]))) == 0.0
-
-
-@pytest.mark.parametrize("kind", FAMILY)
 def test_force_slopes_and_symmetry(kind):
     parameters, by_hand, parity = FAMILY[kind]
     assert effect_parameters(kind) == tuple(parameters)

@@ -21,7 +21,6 @@ from snrmjax.diagnose.naming.evidence import (
     LawSums,
     remainder_stds,
 )
-from snrmjax.diagnose.naming.readings import Readings
 from snrmjax.diagnose.naming.rows import (
     WITHOUT_LAWS,
     Cell,
@@ -31,6 +30,7 @@ from snrmjax.diagnose.naming.rows import (
     RowBlock,
     problem_of,
 )
+from snrmjax.diagnose.readings import Readings
 from snrmjax.identify.test_model.priors import LEVELS
 
 _ROUNDS = 3  # of refined shapes

@@ -25,7 +25,7 @@ from snrmjax.io.models import write_model
 from snrmjax.io.tables import write_table
 from snrmjax.measure.states import relative_errors
 from snrmjax.model.effect_shape import shape_of
-from snrmjax.model.effects import EFFECTS, effect_class
+from snrmjax.model.effects import effect_class
 from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
 from snrmjax.report.figures.diagnosis import (
     CONTROLLED_CAPTION,
@@ -387,7 +387,7 @@ def _limits_section(diagnosis: Diagnosis) -> Section:
     for name, limit in sorted(diagnosis.detection_limits.items()):
         kind, parameter = name.split(".", 1)
         from_value = (number(limit, 2), printed_unit(kind, parameter))
-        if beyond_data(EFFECTS[kind], limit, scales):
+        if beyond_data(kind, limit, scales):
             from_value = ("not detectable in these data", "")
         rows.append((effect_name(kind), parameter_meaning(kind, parameter), *from_value))
     table = ReportTable(
