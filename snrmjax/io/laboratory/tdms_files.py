@@ -105,7 +105,7 @@ def read_tdms(path: Path) -> LaboratoryFile:
         tables.extend(table._replace(name=name) for table in contents.numbered())
         notes.extend(contents.notes)
     return LaboratoryFile(
-        path.name, "tdms", tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
+        path.name, tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
     )
 
 
