@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
+from truths.kinds import dimension
 
 from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
 from snrmjax.model.effect_metadata import (
@@ -51,25 +52,6 @@ def test_an_effect_is_described(kind):
         assert one.unit
         assert one.meaning
     assert effect.shape is not None
-
-
-UNITS = {"kg": (1, 0, 0), "m": (0, 1, 0), "s": (0, 0, 1), "1": (0, 0, 0)}
-POWERS = {"": 1.0, "²": 2.0, "⁴": 4.0, "^1/2": 0.5}
-
-
-def dimension(unit, exponent):
-    """Exponents of kg, m and s of a unit as effects write it."""
-    unit = unit.replace("(kg^1/2 m)^(1-exponent)", "power")
-    above, *below = re.sub(r"\^1/2", "^½", unit).split("/")
-    total = np.zeros(3)
-    for sign, part in ((1, above), *((-1, part) for part in below)):
-        for word in part.strip("()").split():
-            if word == "power":
-                total += (1 - exponent) * np.array([0.5, 1, 0])
-                continue
-            name, power = re.fullmatch(r"(kg|m|s|1)(.*)", word.replace("^½", "^1/2")).groups()
-            total += sign * POWERS[power] * np.array(UNITS[name])
-    return total
 
 
 @pytest.mark.parametrize("kind", FORCES)
