@@ -146,8 +146,8 @@ class OneSidedStop(AbstractNonsmooth):
 class StaticPreload(AbstractMemoryless):
     """A constant force; with a nonlinear stiffness it shifts ω₀ and generates a second harmonic.
 
-    At points it acts on the structure like `static_load`: a positive `constant_force` F moves
-    the equilibrium in the positive direction, f = −F. On the mode of interest it is, like all
+    At points, such as a weight, it pushes the structure: a positive `constant_force` F moves the
+    equilibrium in the positive direction, f = −F. On the mode of interest it is, like all
     forces there, a restoring force on the left of the equation of motion, f = F, and moves the
     equilibrium in the negative direction.
     """
