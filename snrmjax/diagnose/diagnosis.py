@@ -239,7 +239,7 @@ def _answer(
         parameters=checked.parameters,
         status=fit.status,
         completed=completed.whole.model,
-        completed_status=completed.whole.status,
+        extended=completed.whole.extended,
         force_gain=1.0 if gain is None else gain.value,
         probabilities=dict(probabilities),
     )

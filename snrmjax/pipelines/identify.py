@@ -19,7 +19,6 @@ from snrmjax.identify.inference.identification import (
     identify_backbone,
 )
 from snrmjax.identify.inference.optimal_design import (
-    AdviceStatus,
     NextMeasurements,
     next_measurements,
 )
@@ -231,11 +230,9 @@ def _note_on_gain(fit: JointFit) -> tuple[Note, ...]:
 
 
 def _note_on_advice(advice: NextMeasurements | None, options: IdentifyOptions) -> tuple[Note, ...]:
-    if advice is None or advice.status == AdviceStatus.COMPLETE:
+    if advice is None or advice.status.kind == "advice_complete":
         return ()
-    return (
-        Fact("fewer_advised", n=len(advice), wanted=options.further, why=advice.status.message),
-    )
+    return (Fact("fewer_advised", n=len(advice), wanted=options.further, why=advice.status),)
 
 
 def _each_once(notes: tuple[Note, ...]) -> tuple[Note, ...]:
