@@ -7,11 +7,7 @@ import numpy as np
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.residuals import scatter_of_levels
-from snrmjax.diagnose.diagnosis_result import (
-    Diagnosis,
-    Estimate,
-    completed_model,
-)
+from snrmjax.diagnose.diagnosis_result import Diagnosis, Estimate, completed_model
 from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.explained_parts import NamedParts, overall
 from snrmjax.diagnose.fitted_effects import FittedEffects, TriedEffect, refined

@@ -47,11 +47,7 @@ from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_refer
 from snrmjax.diagnose.misfit.locating import Located, locate_misfit
 from snrmjax.diagnose.misfit.noise_model import notes_without_phases, unit_columns
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
-from snrmjax.diagnose.misfit.reference import (
-    driven_by_voltage,
-    with_first_gain,
-    with_reference,
-)
+from snrmjax.diagnose.misfit.reference import driven_by_voltage, with_first_gain, with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.naming.detection import detection_limits
 from snrmjax.diagnose.verdict import Kinds, Verdict

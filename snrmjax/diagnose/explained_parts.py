@@ -27,12 +27,7 @@ from snrmjax.diagnose.readings import (
 )
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
-from snrmjax.identify.pointwise.snrm import (
-    is_single,
-    linear_mode,
-    participation_of,
-    sensed_mode,
-)
+from snrmjax.identify.pointwise.snrm import is_single, linear_mode, participation_of, sensed_mode
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractAddedMode
 from snrmjax.model.effects import EFFECTS

@@ -19,11 +19,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.attachment import InfluenceVector, checked_influence_vector
-from snrmjax.model.effect_metadata import (
-    Parameter,
-    Part,
-    Shape,
-)
+from snrmjax.model.effect_metadata import Parameter, Part, Shape
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.nonsmooth_points import NonsmoothPoints, with_nonsmooth_points
 from snrmjax.model.potential import PolynomialPotential

@@ -28,11 +28,7 @@ from snrmjax.model.library.internal_resonances import (
     InternalResonanceOneToThree,
     InternalResonanceOneToTwo,
 )
-from snrmjax.model.library.joints import (
-    FourParameterIwan,
-    RegularisedFriction,
-    SpringLinkage,
-)
+from snrmjax.model.library.joints import FourParameterIwan, RegularisedFriction, SpringLinkage
 from snrmjax.model.library.linear_changes import (
     AddedMass,
     FrequencyDrift,

@@ -8,21 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.io.exchange.import_map import (
-    Assumptions,
-    ImportMap,
-    read_import_map,
-    steps_of_map,
-)
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap, read_import_map, steps_of_map
 from snrmjax.io.exchange.import_options import STAYS_RECORD
 from snrmjax.io.exchange.importing import Imported, import_files, joined_files
 from snrmjax.io.exchange.own_tables import is_own_file
 from snrmjax.io.exchange.proposals import proposed_commands
-from snrmjax.io.exchange.record_import import (
-    ask_for_rate,
-    at_stated_rate,
-    mapped_record,
-)
+from snrmjax.io.exchange.record_import import ask_for_rate, at_stated_rate, mapped_record
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.reading import SUFFIXES, read_laboratory_file

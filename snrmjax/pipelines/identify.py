@@ -18,10 +18,7 @@ from snrmjax.identify.inference.identification import (
     identification_of_fit,
     identify_backbone,
 )
-from snrmjax.identify.inference.optimal_design import (
-    NextMeasurements,
-    next_measurements,
-)
+from snrmjax.identify.inference.optimal_design import NextMeasurements, next_measurements
 from snrmjax.identify.joint.joint_fit import JointFit, corrected_states, fit_jointly
 from snrmjax.identify.joint.notes import note_on_outlying, outlying_states
 from snrmjax.identify.pointwise.backbone import BackboneValues

@@ -5,10 +5,7 @@ from pathlib import Path
 
 from snrmjax.io.files import FilePath, file_name, read_text
 from snrmjax.io.laboratory.reading import NOT_SEPARATED_TEXT, read_laboratory_file
-from snrmjax.io.laboratory.record_tables import (
-    is_record_table,
-    read_record_table,
-)
+from snrmjax.io.laboratory.record_tables import is_record_table, read_record_table
 from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates

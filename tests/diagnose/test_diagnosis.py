@@ -24,11 +24,7 @@ import snrmjax as sj
 from snrmjax.diagnose.checks.residuals import withheld_level
 from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.misfit.candidates import candidate
-from snrmjax.diagnose.misfit.effect_fit import (
-    baseline_fit,
-    fit_effect,
-    with_propagated_errors,
-)
+from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect, with_propagated_errors
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.response_prediction import (

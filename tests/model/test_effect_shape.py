@@ -1,27 +1,17 @@
 """Metadata of effects against their forces and their dimensions."""
 
 import re
-from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import Array
 from truths.kinds import dimension
+from truths.own_effects import OwnAsymmetry, OwnDrag
 
-from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
-from snrmjax.model.effect_metadata import (
-    Argument,
-    Part,
-    Prior,
-    Shape,
-    Symmetry,
-    parameter,
-)
+from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effect_metadata import Argument, Part, Shape, Symmetry
 from snrmjax.model.effect_shape import computed_shape, shape_of
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.numerics.rules import POSITIVE
 
 FORCES = [kind for kind, effect in EFFECTS.items() if issubclass(effect, AbstractForce)]
 
@@ -73,33 +63,6 @@ def test_units_are_the_dimensions_of_the_force(kind):
     # Rounding in powers of a hundred.
     np.testing.assert_allclose(converted, length / time**2 * np.asarray(force), rtol=1e-9)
     assert np.any(np.asarray(force) != 0)
-
-
-class OwnDrag(AbstractMemoryless):
-    """f = c |q̇|^p sgn q̇: an effect of a user, who states units and a prior."""
-
-    kind: ClassVar[str] = "own_drag"
-    coefficient: Array = parameter("(kg^1/2 m/s)^(1-exponent)/s", prior=Prior(lower=0.0))
-    exponent: Array = parameter("1", rules=(POSITIVE,), prior=Prior(1.0, 3.0), typical=1.5)
-
-    def force(self, displacement, velocity):
-        """See `AbstractMemoryless.force`."""
-        speed = jnp.abs(velocity)
-        safe = jnp.where(speed > 0, speed, 1.0)
-        return (
-            self.coefficient * jnp.sign(velocity) * jnp.where(speed > 0, safe, 0) ** self.exponent
-        )
-
-
-class OwnAsymmetry(AbstractMemoryless):
-    """f = a q⁴, of which nothing is stated."""
-
-    kind: ClassVar[str] = "own_asymmetry"
-    coefficient: Array
-
-    def force(self, displacement, velocity):
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * displacement**4
 
 
 def test_what_a_user_does_not_state_follows_from_the_force():

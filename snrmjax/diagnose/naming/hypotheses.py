@@ -16,11 +16,7 @@ from scipy.special import logsumexp
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column, hypothesis_columns
-from snrmjax.diagnose.naming.evidence import (
-    HarmonicSums,
-    LawSums,
-    remainder_stds,
-)
+from snrmjax.diagnose.naming.evidence import HarmonicSums, LawSums, remainder_stds
 from snrmjax.diagnose.naming.rows import (
     WITHOUT_LAWS,
     Cell,

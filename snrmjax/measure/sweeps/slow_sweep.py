@@ -9,12 +9,7 @@ from jaxtyping import Complex, Float, Int
 
 from snrmjax.measure.recordings.step_counts import RecordStatus
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.recordings.tone_track import (
-    ToneTrack,
-    check_rate,
-    track_tone,
-    unwrapped_phase,
-)
+from snrmjax.measure.recordings.tone_track import ToneTrack, check_rate, track_tone, unwrapped_phase
 from snrmjax.measure.recordings.velocity_states import (
     ChosenChannels,
     Levels,

@@ -6,14 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.model.effect_base import AbstractMemoryless, Scalar
-from snrmjax.model.effect_metadata import (
-    NON_NEGATIVE,
-    Argument,
-    Part,
-    Shape,
-    Symmetry,
-    parameter,
-)
+from snrmjax.model.effect_metadata import NON_NEGATIVE, Argument, Part, Shape, Symmetry, parameter
 
 _OF_VELOCITY = Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY)
 

@@ -13,14 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless, Scalar
-from snrmjax.model.effect_metadata import (
-    Argument,
-    Entries,
-    Part,
-    Shape,
-    Symmetry,
-    parameter,
-)
+from snrmjax.model.effect_metadata import Argument, Entries, Part, Shape, Symmetry, parameter
 from snrmjax.model.library.friction import AbstractSliders, Sliders
 from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE
 

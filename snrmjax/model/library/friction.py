@@ -20,12 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from snrmjax.model.effect_base import (
-    AbstractHysteresis,
-    Samples,
-    Scalar,
-    States,
-)
+from snrmjax.model.effect_base import AbstractHysteresis, Samples, Scalar, States
 from snrmjax.model.effect_metadata import (
     NON_NEGATIVE,
     Argument,

@@ -5,12 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from snrmjax.model.effect_base import AbstractLinearChange, Scalar
-from snrmjax.model.effect_metadata import (
-    POSITIVE_FACTOR,
-    Part,
-    Shape,
-    parameter,
-)
+from snrmjax.model.effect_metadata import POSITIVE_FACTOR, Part, Shape, parameter
 from snrmjax.numerics.rules import ABOVE_MINUS_ONE
 
 

@@ -6,11 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from snrmjax.model.effect_base import (
-    AbstractForceSpectrum,
-    AbstractMeasurementEffect,
-    Scalar,
-)
+from snrmjax.model.effect_base import AbstractForceSpectrum, AbstractMeasurementEffect, Scalar
 from snrmjax.model.effect_metadata import (
     ADDED_MODE_DAMPING,
     POSITIVE_FACTOR,

@@ -14,10 +14,7 @@ from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.detection import beyond_data
 from snrmjax.diagnose.priors import AS_NOISE
-from snrmjax.diagnose.response_prediction import (
-    LevelResponse,
-    is_response_controlled,
-)
+from snrmjax.diagnose.response_prediction import LevelResponse, is_response_controlled
 from snrmjax.diagnose.verdict import NOISE_REJECTED, NONE, UNKNOWN, Verdict
 from snrmjax.io import diagnosis_results as written
 from snrmjax.io.files import write_summary
@@ -49,11 +46,7 @@ from snrmjax.report.html import (
     with_error,
     write_report,
 )
-from snrmjax.report.pages.resonance_table import (
-    resonance_in_words,
-    resonance_rows,
-    velocity_unit,
-)
+from snrmjax.report.pages.resonance_table import resonance_in_words, resonance_rows, velocity_unit
 from snrmjax.report.parameters import (
     own_parameters,
     parameter_meaning,

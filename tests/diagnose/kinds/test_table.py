@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import Array
+from truths.own_effects import OwnAsymmetry, OwnDrag
 
 import snrmjax as sj
 from snrmjax.diagnose.kinds.confounders import CONFOUNDERS
@@ -20,10 +20,9 @@ from snrmjax.diagnose.kinds.registry import (
 from snrmjax.diagnose.kinds.table import HYPOTHESES
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.model.averaging import averaged_effect
-from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
-from snrmjax.model.effect_metadata import MotionScales, Prior, parameter
+from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.numerics.rules import POSITIVE
 
 SCALES = MotionScales(
     amplitude=2e-4, largest=7e-4, frequency=300.0, stiffness=2000.0, receptance=1e-4,
@@ -101,33 +100,6 @@ def test_an_idle_effect_stays_at_its_place():
     idle = idle_effect(stop, 100.0, 0.01)
     assert (type(idle), idle.at) == (type(stop), stop.at)
     assert float(idle.force(jnp.asarray(2.0), jnp.asarray(0.0))) == 0.0
-
-
-class OwnDrag(AbstractMemoryless):
-    """f = c |q̇|^p sgn q̇: an effect of a user, who states units and a prior."""
-
-    kind: ClassVar[str] = "own_drag"
-    coefficient: Array = parameter("(kg^1/2 m/s)^(1-exponent)/s", prior=Prior(lower=0.0))
-    exponent: Array = parameter("1", rules=(POSITIVE,), prior=Prior(1.0, 3.0), typical=1.5)
-
-    def force(self, displacement, velocity):
-        """See `AbstractMemoryless.force`."""
-        speed = jnp.abs(velocity)
-        safe = jnp.where(speed > 0, speed, 1.0)
-        return (
-            self.coefficient * jnp.sign(velocity) * jnp.where(speed > 0, safe, 0) ** self.exponent
-        )
-
-
-class OwnAsymmetry(AbstractMemoryless):
-    """f = a q⁴, of which nothing is stated."""
-
-    kind: ClassVar[str] = "own_asymmetry"
-    coefficient: Array
-
-    def force(self, displacement, velocity):
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * displacement**4
 
 
 FORMER = Confounder("record harmonic 3")

@@ -15,11 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from truths.kinds import KINDS, MEMORYLESS, in_units, of_class, silent
 
-from snrmjax.model.effect_base import (
-    AbstractAddedMode,
-    AbstractHysteresis,
-    AbstractNonsmooth,
-)
+from snrmjax.model.effect_base import AbstractAddedMode, AbstractHysteresis, AbstractNonsmooth
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.structures import simulated_structure, structure
