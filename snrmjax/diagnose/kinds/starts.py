@@ -68,7 +68,7 @@ def steps_of_resonance(start: Start) -> Start:
 
 def of_close_mode(scales: MotionScales) -> list[Start]:
     """Modes a few half-power bandwidths away, of a clearly visible amplitude at resonance."""
-    starts = []
+    starts: list[Start] = []
     ratio = max(scales.damping_ratio, _LIGHT)
     for away in (-8.0, -3.0, 3.0, 8.0):
         fraction = 1 + float(np.clip(away * ratio, -_WIDE, _WIDE))
