@@ -105,7 +105,9 @@ def _column(
     """One column, or none if it changes nothing."""
     law = hypothesis_of(kind)
     higher = np.zeros((len(readings.harmonics), len(readings.force)), complex)
-    change = law.change(readings, *shape) if law.change is not None else higher[0]
+    if law.change is None:
+        return []
+    change = law.change(readings, *shape)
     if law.higher is not None:
         for index, one in enumerate(readings.harmonics):
             higher[index] = law.higher(readings, one, *shape)
