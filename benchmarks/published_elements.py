@@ -119,7 +119,7 @@ def _mode_of_two_masses() -> Rows:
 
 
 def _regularised_friction() -> Rows:
-    friction = _element("regularised_friction", "x1", force_limit=5.0, velocity=0.05)
+    friction = _element("regularised_friction", "x1", slip_force=5.0, velocity=0.05)
     chain = sj.model.chain([0.02, 1.0], [0.0, 40.0, 600.0])
     model = sj.model.from_matrices(*chain, force="x1", effects=friction)
     natural = np.asarray(model.modes.natural_frequency)
@@ -234,7 +234,7 @@ def _iwan() -> Rows:
 
 
 def _friction_at_a_node() -> Rows:
-    friction = _element("regularised_friction", "w3", force_limit=1.5, velocity=6e-7)
+    friction = _element("regularised_friction", "w3", slip_force=1.5, velocity=6e-7)
     mass, _, stiffness, points = sj.model.beam(185e9 * 0.1**3 * 0.3 / 12, 7830 * 0.03, 2.0, 8)
     held = [k for k, point in enumerate(points) if point != "w3"]
     stuck = sj.model.from_matrices(

@@ -83,8 +83,10 @@ SUB_ROOMS = {
     "methods.steady": {"methods.result", "methods.one_sensor"},
     "methods.records": {"methods.result", "methods.one_sensor"},
     "identify.test_model": {"identify.checks", "identify.curves"},
-    "diagnose.misfit": {"diagnose.priors"},
-    "diagnose.naming": {"diagnose.priors"},
+    # What a diagnosis knows of every kind of effect.
+    "diagnose.kinds": {"diagnose.priors", "diagnose.readings"},
+    "diagnose.misfit": {"diagnose.priors", "diagnose.kinds"},
+    "diagnose.naming": {"diagnose.priors", "diagnose.readings", "diagnose.kinds"},
     "diagnose.checks": {"diagnose.misfit", "diagnose.priors"},
     "diagnose.location": {"diagnose.misfit"},
     "io.calculix": {"io.files"},

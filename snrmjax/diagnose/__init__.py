@@ -4,10 +4,11 @@
 2. `identify.test_model.posterior.fit_test` fits smooth curves to the states, without any law. They
    give the sensitivity to amplitude errors and, where not stated, the noise and the level errors.
    `naming.phases` gives states without phases those of such curves.
-3. `naming.readings` computes the residual of each state's dynamic stiffness, and of each other
+3. `readings` computes the residual of each state's dynamic stiffness, and of each other
    harmonic of the force, whitened by all errors. `explained_parts` combines both.
-4. `naming.laws` has the change of these by every kind of effect, to first order: columns
-   (`naming.columns`), one for each grid value of a nonlinear parameter.
+4. `kinds.table` has the change of these by every kind of effect, to first order, and all else that
+   a diagnosis knows of it: columns (`naming.columns`), one for each grid value of a nonlinear
+   parameter.
 5. `naming.rows` sets up the linear problem, `naming.evidence` has the evidence of laws in closed
    form, and `naming.hypotheses` compares single laws, pairs, and larger sets grown from the best
    of these, over a grid of remainder standard deviations; it refines the shapes that matter.

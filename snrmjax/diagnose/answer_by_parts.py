@@ -7,12 +7,7 @@ import numpy as np
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.residuals import scatter_of_levels
-from snrmjax.diagnose.diagnosis_result import (
-    CompletedStatus,
-    Diagnosis,
-    Estimate,
-    completed_model,
-)
+from snrmjax.diagnose.diagnosis_result import Diagnosis, Estimate, completed_model
 from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.explained_parts import NamedParts, overall
 from snrmjax.diagnose.fitted_effects import FittedEffects, TriedEffect, refined
@@ -188,7 +183,7 @@ def completed_by_parts(
     }
     baseline = {name: value for name, value in linear.items() if name in baseline}
     whole = completed_model(model, baseline, *_structural(naming.effects, parameters))
-    completed, status, reason = whole.model, whole.status, whole.reason
+    completed, extended, reason = whole
     # Without a level the readings may name other laws: no cross-validation here.
     checks = diagnosis.checks._replace(completed_without={})
     gap = diagnosis.gap._replace(after=naming.misfit, interpolated=None, extrapolated=None)
@@ -197,7 +192,7 @@ def completed_by_parts(
     if remainders and completed is not None:
         added = remainder_laws(named.problem, remainders)
         completed = dataclasses.replace(completed, effects=(*completed.effects, *added))
-        status = CompletedStatus.COMPLETED
+        extended = True
         if diagnosis.verdict is Verdict.DRAWN:
             laws = tuple(_drawn(named, part, one) for part, one in remainders.items())
             drawn = tuple(DRAWN[part] for part in remainders)
@@ -209,7 +204,7 @@ def completed_by_parts(
         candidates=(*naming.candidates, *((kind,) for kind in drawn)),
         parameters=parameters,
         completed=completed,
-        completed_status=status,
+        extended=extended,
         laws=laws,
     )
     return dataclasses.replace(diagnosis, answer=answer, gap=gap, checks=checks, notes=notes)

@@ -42,15 +42,12 @@ from snrmjax.diagnose.diagnosis_result import (
 )
 from snrmjax.diagnose.explained_parts import named_parts
 from snrmjax.diagnose.fitted_effects import FittedEffects
+from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference
 from snrmjax.diagnose.misfit.locating import Located, locate_misfit
 from snrmjax.diagnose.misfit.noise_model import notes_without_phases, unit_columns
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
-from snrmjax.diagnose.misfit.reference import (
-    driven_by_voltage,
-    with_first_gain,
-    with_reference,
-)
+from snrmjax.diagnose.misfit.reference import driven_by_voltage, with_first_gain, with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.naming.detection import detection_limits
 from snrmjax.diagnose.verdict import Kinds, Verdict
@@ -238,7 +235,7 @@ def _answer(
         parameters=checked.parameters,
         status=fit.status,
         completed=completed.whole.model,
-        completed_status=completed.whole.status,
+        extended=completed.whole.extended,
         force_gain=1.0 if gain is None else gain.value,
         probabilities=dict(probabilities),
     )
@@ -248,11 +245,11 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
     """Kinds of effects excluded from the search."""
     excluded = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # a free gain already covers gain and mass errors
-        excluded |= {kind for kind, effect in EFFECTS.items() if effect.like_force_gain}
+        excluded |= {kind for kind in EFFECTS if hypothesis_of(kind).like_force_gain}
     if force_gain_std > priors.LOOSE_GAIN:
-        excluded |= {kind for kind, effect in EFFECTS.items() if effect.follows_force}
+        excluded |= {kind for kind in EFFECTS if hypothesis_of(kind).follows_force}
     if not phases:
-        excluded |= {kind for kind, effect in EFFECTS.items() if effect.only_phase}
+        excluded |= {kind for kind in EFFECTS if hypothesis_of(kind).only_phase}
     return excluded
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping
-from enum import StrEnum
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -29,19 +28,11 @@ from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.rules import InputError, Rule
 
 
-class CompletedStatus(StrEnum):
-    """Whether there is a completed model."""
-
-    COMPLETED = "completed"
-    NOTHING_ADDED = "nothing_added"  # the model as given
-    NOT_PHYSICAL = "not_physical"  # the best-fit parameters are not physical
-
-
 class CompletedModel(NamedTuple):
     """The completed model, or the reason why there is none."""
 
     model: Structure | None
-    status: CompletedStatus
+    extended: bool  # whether effects were added
     reason: str = ""
 
 
@@ -58,7 +49,7 @@ def completed_model(
     place of a model.
     """
     if not kinds:
-        return CompletedModel(model, CompletedStatus.NOTHING_ADDED)
+        return CompletedModel(model, extended=False)
     try:
         for name, value in baseline.items():
             for rule in (Rule("finite", np.isfinite), *parameter_rules(model, name)):
@@ -69,10 +60,10 @@ def completed_model(
             for kind in kinds
         )
     except InputError as error:
-        return CompletedModel(None, CompletedStatus.NOT_PHYSICAL, str(error))
+        return CompletedModel(None, extended=False, reason=str(error))
     updated = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
     completed = dataclasses.replace(updated, effects=(*model.effects, *added))
-    return CompletedModel(completed, CompletedStatus.COMPLETED)
+    return CompletedModel(completed, extended=True)
 
 
 class Estimate(NamedTuple):
@@ -90,7 +81,7 @@ class Answer(NamedTuple):
     parameters: dict[str, Estimate]
     status: MinimisationStatus
     completed: Structure | None  # None where these parameters are not physical
-    completed_status: CompletedStatus
+    extended: bool  # whether it has effects that the given model lacks
     force_gain: float  # acting over recorded force, where a gain was free; else 1
     probabilities: dict[Kinds, float]  # of all answers considered
     laws: tuple[DrawnLaw, ...] = ()  # where the verdict is `DRAWN`, the most important first
@@ -189,7 +180,7 @@ class Diagnosis(AbstractResult):
 
     @property
     def completed(self) -> Structure | None:
-        """The model with the effects; None where `answer.completed_status` is `NOT_PHYSICAL`."""
+        """The model with the effects; None where their parameters are not physical."""
         return self.answer.completed
 
     @property
@@ -224,7 +215,8 @@ class Diagnosis(AbstractResult):
         """See `AbstractResult`."""
         gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
         unsure = bool(self.parameters) and gap.after > priors.AS_NOISE
-        completion = self.answer.completed_status
+        added = "completed" if self.answer.extended else "nothing_added"
+        completion = "not_physical" if self.completed is None else added
         lines = [
             Fact("probability_of_verdict", probability=self.most_probable()),
             *(
@@ -238,7 +230,7 @@ class Diagnosis(AbstractResult):
                 if out is not None
             ),
             *([] if self.recommended is None else [Fact("to_decide", by=self.recommended)]),
-            Fact("diagnosis_ended", fit=self.answer.status.value, completed=completion.value),
+            Fact("diagnosis_ended", fit=self.answer.status.value, completed=completion),
             *(Fact("diagnosis_note", note=note) for note in self.notes),
         ]
         return (f"Diagnosis: {self.verdict_sentence}", *map(str, lines))

@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.diagnose import priors
+from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
-from snrmjax.diagnose.naming.columns import is_instrument
 from snrmjax.diagnose.naming.hypotheses import best_hypotheses
 from snrmjax.diagnose.naming.parts import Naming, naming_of
 from snrmjax.diagnose.naming.phases import likely_dynamic_stiffness
-from snrmjax.diagnose.naming.readings import (
+from snrmjax.diagnose.naming.rows import Problem
+from snrmjax.diagnose.readings import (
     LinearTest,
     ModelMotion,
     MotionOfModel,
@@ -24,23 +25,13 @@ from snrmjax.diagnose.naming.readings import (
     RecordedHarmonics,
     readings_of,
 )
-from snrmjax.diagnose.naming.rows import Problem
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
-from snrmjax.identify.pointwise.snrm import (
-    is_single,
-    linear_mode,
-    participation_of,
-    sensed_mode,
-)
+from snrmjax.identify.pointwise.snrm import is_single, linear_mode, participation_of, sensed_mode
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractAddedMode
 from snrmjax.model.effects import EFFECTS
-from snrmjax.model.library.measurement_chain import (
-    CloseMode,
-    ModeShapeChange,
-    ResidualMode,
-)
+from snrmjax.model.library.measurement_chain import ModeShapeChange
 from snrmjax.model.modes import linear_response, residual_velocity
 from snrmjax.numerics.blocks import padded
 
@@ -74,19 +65,24 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     gain, phase, *_ = readings.posterior.hyper.level_std
     # A gain or phase common to all levels may be the mean of level errors as large as that.
     if gain > priors.OF_LEVELS * priors.GAIN:
-        kinds = [k for k in kinds if not (is_instrument(k) and EFFECTS[k].like_force_gain)]
+        kinds = [k for k in kinds if not _is_gain(k)]
     if phase > priors.OF_LEVELS * priors.INSTRUMENT_PHASE:
-        kinds = [k for k in kinds if not (is_instrument(k) and EFFECTS[k].only_phase)]
+        kinds = [k for k in kinds if not hypothesis_of(k).only_phase]
     problem, cells = best_hypotheses(readings, kinds)
     return NamedParts(naming_of(problem, cells), problem)
 
 
 def _shows_at_one_phase(kind: str) -> bool:
     """Whether states at a controlled phase can show an effect."""
-    effect = EFFECTS[kind]
-    by_instrument = is_instrument(kind) and (effect.like_force_gain or effect.only_phase)
-    added = issubclass(effect, (AbstractAddedMode, CloseMode, ResidualMode))
-    return not (by_instrument or added)
+    one = hypothesis_of(kind)
+    adds_mode = one.follows_force or issubclass(EFFECTS[kind], AbstractAddedMode)
+    return not (adds_mode or one.only_phase or _is_gain(kind))
+
+
+def _is_gain(kind: str) -> bool:
+    """Whether an effect is a gain error of an instrument; an added mass is none."""
+    one = hypothesis_of(kind)
+    return one.of_instrument and one.like_force_gain
 
 
 def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predictions:

@@ -10,6 +10,7 @@ import numpy as np
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.diagnose.kinds.registry import idle_effect
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.identify.pointwise.missing_resonance import jump_at_resonance
 from snrmjax.identify.test_model.priors import ONE_PHASE
@@ -101,7 +102,7 @@ def predicted_levels(
     n, chosen = len(forces), [level for level in forces if level in without_level]
     modes, j = model.modes, model.modes.mode_of_interest
     mode = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
-    idle = tuple(e.idle(*mode) for e in completed.effects[len(model.effects) :])
+    idle = tuple(idle_effect(e, *mode) for e in completed.effects[len(model.effects) :])
     given = dataclasses.replace(model, effects=(*model.effects, *idle))
     models = [given] * n + [completed] * n + [without_level[level] for level in chosen]
     acting = [force_gain * force for force in (*forces.values(), *(forces[k] for k in chosen))]

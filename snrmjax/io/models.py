@@ -11,6 +11,7 @@ import tomli_w
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
 from snrmjax.io.structure_matrices import (
     element_participation,
+    influence_vector_of,
     listed_sensors,
     moving_base,
     structure_of_matrices,
@@ -18,11 +19,10 @@ from snrmjax.io.structure_matrices import (
 )
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
-from snrmjax.model.attachment import InfluenceVector, between, influence_vector
+from snrmjax.model import effects as known
 from snrmjax.model.builders.free_coordinates import coupled_first
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries
-from snrmjax.model.effects import SURFACES, effect_class, known_effects, make_effect
 from snrmjax.model.modes import (
     UNSTATED_MODAL_MASS_STD,
     LinearModes,
@@ -47,7 +47,6 @@ _TOP_KEYS = (
     *("potential", "effect", "measurement", "sensors", "structure", "force", "base"),
 )
 _OF_MODES = ("mode", "rigid_body_mode", "damping_coupling", "potential")
-
 
 _Rules = dict[str, tuple[Rule, ...]]
 # The keys of numbers of each table with their rules; standard deviations may be missing.
@@ -295,13 +294,18 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
 def _effect(table: TomlTable) -> AbstractEffect:
     if "kind" not in table.entries:
         raise InputError(f"{table.location} lacks the key `kind`.")
-    kind, known_kinds = table.text("kind"), tuple(known_effects())
-    if kind not in known_kinds:
-        near = suggestion(kind, known_kinds) or f" (known are {', '.join(sorted(known_kinds))})"
+    at_points = bool(table.entries.keys() & {"at", "between"})
+    try:
+        kind, entries = known.present_names(table.text("kind"), table.entries, at_points=at_points)
+    except InputError as error:
+        raise InputError(f"{table.location}: {error}") from error
+    kinds = known.known_effects()
+    if kind not in kinds:
+        near = suggestion(kind, kinds) or f" (known are {', '.join(sorted(kinds))})"
         raise InputError(f"{table.location} has the unknown kind {shown(kind)}{near}.")
-    wanted = effect_class(kind).parameters()
-    table = TomlTable(table.entries, f"{table.location} ({kind})")
-    across = ("normal_at", "normal_between") if kind in SURFACES else ()
+    wanted = known.effect_class(kind).parameters()
+    table = TomlTable(entries, f"{table.location} ({kind})")
+    across = ("normal_at", "normal_between") if kind in known.SURFACES else ()
     table.check_keys(("kind", *wanted), ("at", "between", *across))
     values: dict[str, float | np.ndarray] = {
         name: table.number(name, *parameter.rules)
@@ -310,30 +314,14 @@ def _effect(table: TomlTable) -> AbstractEffect:
         for name, parameter in wanted.items()
     }
     try:
-        return make_effect(
-            kind, values, at=_influence_vector(table), normal_at=_influence_vector(table, "normal_")
+        return known.make_effect(
+            kind,
+            values,
+            at=influence_vector_of(table),
+            normal_at=influence_vector_of(table, "normal_"),
         )
     except ValueError as error:
         raise InputError(f"{table.location} cannot be read: {error}") from error
-
-
-def _influence_vector(table: TomlTable, side: str = "") -> InfluenceVector | None:
-    """Influence vector of an effect: `at` a point or weighted points, `between` two points."""
-    one, pair = f"{side}at", f"{side}between"
-    if one in table.entries and pair in table.entries:
-        raise InputError(f"{table.location} has both `{one}` and `{pair}`.")
-    if pair in table.entries:
-        two = table.entries[pair]
-        if not isinstance(two, list) or len(two) != 2 or not all(isinstance(p, str) for p in two):
-            raise table.refusal(pair, "two points", two)
-        if two[0] == two[1]:
-            raise table.refusal(pair, "two different points", two)
-        return between(*two)
-    at = table.entries.get(one)
-    if at is None or isinstance(at, str):
-        return None if at is None else influence_vector(at)
-    weights = table.table(one, f"`{one}` of {table.location}")
-    return influence_vector({point: weights.number(point) for point in weights.entries})
 
 
 def write_model(path: FilePath, model: Structure) -> None:
@@ -428,14 +416,14 @@ def _entries(model: Structure) -> dict[str, object]:
 
 
 def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
-    if effect.kind not in known_effects():
+    if effect.kind not in known.known_effects():
         raise InputError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
     entry: dict[str, object] = {"kind": effect.kind}
     for side in ("at", "normal_at"):
         row = getattr(effect, side, None)
         if row is not None:
             entry[side] = row[0][0] if len(row) == 1 and row[0][1] == 1 else dict(row)
-    for name, parameter in effect_class(effect.kind).parameters().items():
+    for name, parameter in known.effect_class(effect.kind).parameters().items():
         value = getattr(effect, name)
         entry[name] = (
             _one(name, value) if parameter.entries is Entries.ONE else np.ravel(value).tolist()

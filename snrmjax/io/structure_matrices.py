@@ -17,6 +17,7 @@ from snrmjax.io.laboratory.arrays.matlab_elements import checked_variables
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.io.toml_table import TomlTable
 from snrmjax.io.units import DEGREE
+from snrmjax.model.attachment import InfluenceVector, between, influence_vector
 from snrmjax.model.builders.matrices import check_names, from_matrices
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.moving_base import MOTIONS, BaseMotion, base_motion
@@ -277,3 +278,22 @@ def _force(table: TomlTable) -> dict[str, complex]:
         else:
             force[point] = weights.number(point, NOT_ZERO)
     return force
+
+
+def influence_vector_of(table: TomlTable, side: str = "") -> InfluenceVector | None:
+    """Influence vector of an effect: `at` a point or weighted points, `between` two points."""
+    one, pair = f"{side}at", f"{side}between"
+    if one in table.entries and pair in table.entries:
+        raise InputError(f"{table.location} has both `{one}` and `{pair}`.")
+    if pair in table.entries:
+        two = table.entries[pair]
+        if not isinstance(two, list) or len(two) != 2 or not all(isinstance(p, str) for p in two):
+            raise table.refusal(pair, "two points", two)
+        if two[0] == two[1]:
+            raise table.refusal(pair, "two different points", two)
+        return between(*two)
+    at = table.entries.get(one)
+    if at is None or isinstance(at, str):
+        return None if at is None else influence_vector(at)
+    weights = table.table(one, f"`{one}` of {table.location}")
+    return influence_vector({point: weights.number(point) for point in weights.entries})

@@ -7,5 +7,11 @@ from snrmjax.numerics.names import with_retired_names
 # The public names are in `__init__.pyi`; each module is imported with its first name.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __getattr__ = with_retired_names(
-    __name__, __getattr__, {"AbstractKinked": "AbstractNonsmooth", "Confusion": "Confounder"}
+    __name__,
+    __getattr__,
+    {
+        "AbstractKinked": "AbstractNonsmooth",
+        "Confounder": "snrmjax.diagnose.Confounder",
+        "Confusion": "snrmjax.diagnose.Confounder",
+    },
 )

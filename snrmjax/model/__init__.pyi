@@ -12,7 +12,6 @@ from .effect_base import (
 )
 from .effect_metadata import (
     Argument,
-    Confounder,
     MotionScales,
     Parameter,
     Part,
@@ -50,7 +49,6 @@ __all__ = [
     "AbstractNonsmooth",
     "Argument",
     "BaseMotion",
-    "Confounder",
     "LinearModes",
     "LinearModesStd",
     "Matrices",

@@ -19,13 +19,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.attachment import InfluenceVector, checked_influence_vector
-from snrmjax.model.effect_metadata import (
-    Confounder,
-    MotionScales,
-    Parameter,
-    Part,
-    Shape,
-)
+from snrmjax.model.effect_metadata import Parameter, Part, Shape
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.nonsmooth_points import NonsmoothPoints, with_nonsmooth_points
 from snrmjax.model.potential import PolynomialPotential
@@ -36,14 +30,10 @@ Samples = Float[Array, " time"]
 States = Float[Array, " state"]
 StateAt = Float[Array, ""] | Float[Array, " attachment"]
 """Displacement or velocity at a force: a number, or one for each of several attachments."""
-Starts = list[tuple[float, ...]]
-"""Starting values of a fit: parameters in the order of the constructor."""
-Bounds = list[tuple[float, float]]
-"""Lower and upper bound of every parameter in a fit."""
 
 
 class AbstractEffect(eqx.Module):
-    """One physical effect, defined once: its equation, and what a diagnosis must know about it.
+    """One physical effect: its equation and its parameters.
 
     Effects act on the mode of interest alone: on its modal coordinate q, its linear terms, or
     its measured response. Forces may act at points instead (`AbstractForce`) and then couple
@@ -57,25 +47,14 @@ class AbstractEffect(eqx.Module):
 
     - `description`: the physical mechanism, in one sentence for reports;
     - `shape`: which part of the force balance it changes, its symmetry and its power of amplitude;
-      computed from the force where not given (see `shape_of`);
-    - `confounders`: other effects that could produce the same data, and the measurement that
-      separates them;
-    - `like_force_gain`: equivalent to a gain of all forces;
-    - `follows_force`: it adds a linear response to the force, which could be the whole response
-      if the force gain is unknown;
-    - `only_phase`: it does not change amplitudes;
-    - `searched`: whether a diagnosis tests it as a hypothesis of its own, or only as an
-      alternative to another one.
+      computed from the force where not given (see `shape_of`).
+
+    How a diagnosis looks for it is stated in `snrmjax.diagnose`: see `register_hypothesis`.
     """
 
     kind: ClassVar[str]
     description: ClassVar[str] = ""
     shape: ClassVar[Shape | None] = None
-    confounders: ClassVar[tuple[Confounder, ...]] = ()
-    like_force_gain: ClassVar[bool] = False
-    follows_force: ClassVar[bool] = False
-    only_phase: ClassVar[bool] = False
-    searched: ClassVar[bool] = True
 
     @classmethod
     def parameters(cls) -> dict[str, Parameter]:
@@ -85,51 +64,6 @@ class AbstractEffect(eqx.Module):
             for field in dataclasses.fields(cls)
             if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         }
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """Starting values of a fit to measured states, of clearly visible strength.
-
-        From the parameters' own `start` where the strength has one, otherwise from the factor and
-        the power of amplitude of `shape`. Empty without either: the strength is then computed
-        from the force (see `starts_of`).
-        """
-        stated = list(cls.parameters().values())
-        if stated[0].start is not None:
-            return [tuple(of.start(scales) if of.start else of.typical for of in stated)]
-        shape = cls.shape
-        if shape is None or shape.factor is None or shape.power is None:
-            return []
-        per_strength = shape.factor * scales.amplitude**shape.power
-        strength = scales.change / (per_strength * scales.frequency**shape.frequency_power)
-        return [(strength, *(other.typical for other in stated[1:]))]
-
-    @classmethod
-    def bounds(cls, scales: MotionScales) -> Bounds:
-        """Lower and upper bound of every parameter in a fit."""
-        return [parameter.prior.bounds(scales) for parameter in cls.parameters().values()]
-
-    @classmethod
-    def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
-        """A clearly visible change of every parameter, from the magnitudes of a start."""
-        return start
-
-    @classmethod
-    def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
-        """The effect at zero strength, its other parameters at their typical values.
-
-        Arguments: natural frequency (rad/s) and damping ratio of the mode of interest.
-        """
-        _, *others = cls.parameters().values()
-        values = (0.0, *(parameter.typical for parameter in others))
-        return cls(*jax.device_put([np.asarray(value) for value in values]))
-
-    def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
-        """An effect with the same array shapes at zero strength.
-
-        Arguments: see `without_strength`.
-        """
-        return type(self).without_strength(natural_frequency, damping_ratio)
 
 
 class AbstractForce(AbstractEffect):
@@ -152,11 +86,6 @@ class AbstractForce(AbstractEffect):
         With several, displacements, velocities and forces have a last axis for them.
         """
         return (self.at,)
-
-    def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
-        """See `AbstractEffect`; it acts at the same points."""
-        idle = super().idle(natural_frequency, damping_ratio)
-        return dataclasses.replace(idle, at=self.at)
 
     @abstractmethod
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:

@@ -1,4 +1,4 @@
-"""Metadata of an effect in addition to its equation: parameters, shape, confounders."""
+"""Metadata of an effect in addition to its equation: parameters and shape."""
 
 import dataclasses
 from collections.abc import Callable
@@ -157,17 +157,3 @@ class Shape(NamedTuple):
     def grows(self) -> bool:
         """Whether it is damping that increases with amplitude."""
         return self.part is Part.DAMPING and self.power is not None and self.power > 0
-
-
-class Confounder(NamedTuple):
-    """Effects that measured states may not distinguish, and the measurement that does.
-
-    The effects are those whose classes name it among their `confounders`. With `by_itself` the
-    measurement is proposed where one of them competes with any other effect. With
-    `by_calibration` they are equivalent in every test of one mode: only a calibration separates
-    them.
-    """
-
-    separated_by: str
-    by_itself: bool = False
-    by_calibration: bool = False

@@ -1,4 +1,4 @@
-"""Properties computed from a force alone: its shape, and the starting strength of a fit."""
+"""How an effect depends on amplitude, as declared or computed from its force alone."""
 
 from functools import lru_cache
 
@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.model.averaging import averaged_effect
-from snrmjax.model.effect_base import AbstractEffect, AbstractForce, AbstractMemoryless, Starts
-from snrmjax.model.effect_metadata import Argument, MotionScales, Part, Shape, Symmetry
+from snrmjax.model.effect_base import AbstractEffect, AbstractForce, AbstractMemoryless
+from snrmjax.model.effect_metadata import Argument, Part, Shape, Symmetry
 
 _AMPLITUDES = np.logspace(-5, -1, 5)  # kg^1/2 m, at which a force is evaluated
 _FREQUENCY = 100.0  # rad/s, there
@@ -90,33 +90,3 @@ def _argument(effect: AbstractForce, q: np.ndarray, v: np.ndarray) -> Argument:
     if np.max(np.abs(of_q - both)) <= scale:
         return Argument.DISPLACEMENT
     return Argument.VELOCITY if np.max(np.abs(of_v - both)) <= scale else Argument.BOTH
-
-
-def starts_of(effect: type[AbstractEffect], scales: MotionScales) -> Starts:
-    """Starting values of a fit: those of the class, or of a clearly visible strength.
-
-    A force without its own starts from its typical parameters and the strength that changes the
-    dynamic stiffness by `MotionScales.change`, with either sign if it acts on the fundamental only
-    through other harmonics. Other effects start from their typical values.
-    """
-    if stated := effect.starts(scales):
-        return stated
-    typical = [parameter.typical for parameter in effect.parameters().values()]
-    if not issubclass(effect, AbstractForce):
-        return [tuple(typical)]
-    first, *others = typical
-    typical_effect = effect(*(jnp.asarray(value) for value in typical))
-    shape = shape_of(effect)
-    if shape is not None and shape.strength_order > 1:
-        # As a quadratic stiffness softens: Δ(ω̃²) = −(5/6) (f/Q)²/ω₀².
-        q = scales.amplitude * np.cos(_PHASE)
-        v = -scales.amplitude * scales.frequency * np.sin(_PHASE)
-        magnitude = float(
-            jnp.max(jnp.abs(typical_effect.cycle_force(jnp.asarray(q), jnp.asarray(v))))
-        )
-        strength = np.sqrt(1.2 * scales.change) * scales.frequency * scales.amplitude / magnitude
-        return [(float(sign * first * strength), *others) for sign in (1.0, -1.0)]
-    at = (jnp.asarray(scales.amplitude), jnp.asarray(scales.frequency))
-    change = averaged_effect(typical_effect, *at)
-    magnitude = float(jnp.hypot(change.stiffness, scales.frequency * change.damping))
-    return [(first * (scales.change / magnitude if magnitude > 0 else 1.0), *others)]

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,12 +28,7 @@ from snrmjax.model.library.internal_resonances import (
     InternalResonanceOneToThree,
     InternalResonanceOneToTwo,
 )
-from snrmjax.model.library.joints import (
-    FourParameterIwan,
-    RegularisedFriction,
-    SpringLinkage,
-    StaticLoad,
-)
+from snrmjax.model.library.joints import FourParameterIwan, RegularisedFriction, SpringLinkage
 from snrmjax.model.library.linear_changes import (
     AddedMass,
     FrequencyDrift,
@@ -147,7 +143,6 @@ ELEMENTS: dict[str, type[AbstractEffect]] = EffectTable(
     for element in (
         RegularisedFriction,
         SpringLinkage,
-        StaticLoad,
         FourParameterIwan,
         BoucWen,
         FrictionContact,
@@ -156,6 +151,14 @@ ELEMENTS: dict[str, type[AbstractEffect]] = EffectTable(
 """Further nonlinear elements between points, by their kind; not hypotheses of a diagnosis."""
 
 EFFECTS.further = ELEMENTS
+
+_FORMER_KINDS = {"static_load": StaticPreload.kind}
+_FURTHER_NAMES = {
+    (StaticPreload.kind, "load"): "constant_force",
+    (RegularisedFriction.kind, "force_limit"): "slip_force",
+    # `force` in files and results, by their definition; `slip_force` as in all other friction.
+    (CoulombFriction.kind, "slip_force"): "force",
+}
 
 SURFACES = (FrictionContact.kind,)
 """Kinds of elements with a normal (`normal_at`) and a tangential (`at`) attachment."""
@@ -215,6 +218,26 @@ def effect_parameters(kind: str) -> tuple[str, ...]:
     return tuple(effect_class(kind).parameters())
 
 
+def present_names(
+    kind: str, entries: Mapping[str, Any], *, at_points: bool
+) -> tuple[str, dict[str, Any]]:
+    """A kind and its entries, of which former and further names are accepted.
+
+    Raises `ValueError` for two names of one parameter, and for a former element of points alone
+    on the mode of interest.
+
+    >>> present_names("regularised_friction", {"force_limit": 2.0, "velocity": 0.1}, at_points=True)
+    ('regularised_friction', {'slip_force': 2.0, 'velocity': 0.1})
+    """
+    if kind in _FORMER_KINDS and not at_points:
+        raise InputError(f"{kind} acts at points only: state them by `at`.")
+    kind = _FORMER_KINDS.get(kind, kind)
+    named = {_FURTHER_NAMES.get((kind, name), name): value for name, value in entries.items()}
+    if len(named) < len(entries):
+        raise InputError(f"{kind} has two names of one parameter: {sorted(entries)}.")
+    return kind, named
+
+
 def make_effect(
     kind: str,
     parameters: Mapping[str, float | Array | np.ndarray],
@@ -237,6 +260,7 @@ def make_effect(
     >>> drag.cycle_force(jnp.array([1.0, 0.0]), jnp.array([0.0, -3.0]))
     Array([  0., -18.], dtype=float64)
     """
+    kind, parameters = present_names(kind, parameters, at_points=at is not None)
     if kind not in known_effects():
         raise InputError(f"unknown effect kind {kind!r}; known are {sorted(known_effects())}.")
     wanted = effect_class(kind).parameters()

@@ -1,6 +1,7 @@
 """Names: suggestions for misspelt ones in error messages, and aliases of former public ones."""
 
 import difflib
+import importlib
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -34,18 +35,22 @@ def with_retired_names(
 ) -> Callable[[str], Any]:
     """The `__getattr__` of a package, with `names` from former to present ones.
 
-    A former name gives the present object with a `DeprecationWarning`.
+    A former name gives the present object with a `DeprecationWarning`. A present name with dots is
+    in another package.
     """
 
     def attribute(name: str) -> Any:
         if name not in names:
             return current(name)
+        elsewhere, _, present = names[name].rpartition(".")
         warnings.warn(
-            f"{package}.{name} is now {package}.{names[name]}: the former name goes in the next "
-            "release.",
+            f"{package}.{name} is now {elsewhere or package}.{present}: the former name goes in "
+            "the next release.",
             DeprecationWarning,
             stacklevel=2,
         )
-        return current(names[name])
+        if elsewhere:
+            return getattr(importlib.import_module(elsewhere), present)
+        return current(present)
 
     return attribute

@@ -8,24 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.io.exchange.import_map import (
-    Assumptions,
-    ImportMap,
-    read_import_map,
-    steps_of_map,
-)
+from snrmjax.io.exchange.import_map import Assumptions, ImportMap, read_import_map, steps_of_map
 from snrmjax.io.exchange.import_options import STAYS_RECORD
 from snrmjax.io.exchange.importing import Imported, import_files, joined_files
 from snrmjax.io.exchange.own_tables import is_own_file
 from snrmjax.io.exchange.proposals import proposed_commands
-from snrmjax.io.exchange.record_import import (
-    ask_for_rate,
-    at_stated_rate,
-    mapped_record,
-)
+from snrmjax.io.exchange.record_import import ask_for_rate, at_stated_rate, mapped_record
 from snrmjax.io.files import read_text
 from snrmjax.io.laboratory.contents import LaboratoryFile
-from snrmjax.io.laboratory.reading import read_laboratory_file
+from snrmjax.io.laboratory.reading import SUFFIXES, read_laboratory_file
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import check_driven_alike, read_steady_states
 from snrmjax.measure.base_excitation import states_relative_to_base
@@ -36,10 +27,6 @@ from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import InputError
 
-_MEASURED = (
-    *(".csv", ".uff", ".unv", ".unv58", ".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf"),
-    *(".tdms", ".lvm", ".tsv", ".dat", ".asc"),
-)
 MAP = "map.toml"
 _WRITTEN = (".txt", ".md", ".log")  # notes; a .txt may also hold measurements
 _AXES = ("frequency", "time")
@@ -169,7 +156,7 @@ def read_test_files(
         elif suffix in _WRITTEN and _readable(path):
             passed.append((path.name, "not used: a text of the laboratory, shown below"))
             texts.append((path.name, _lines(path)))
-        elif suffix not in _MEASURED:
+        elif suffix not in SUFFIXES:
             passed.append((path.name, "not used: not a measurement file, by its suffix"))
         elif suffix == ".csv" and is_own_file(path):
             states.append(NamedStates(path.name, read_steady_states(path), path))

@@ -18,11 +18,7 @@ from snrmjax.identify.inference.identification import (
     identification_of_fit,
     identify_backbone,
 )
-from snrmjax.identify.inference.optimal_design import (
-    AdviceStatus,
-    NextMeasurements,
-    next_measurements,
-)
+from snrmjax.identify.inference.optimal_design import NextMeasurements, next_measurements
 from snrmjax.identify.joint.joint_fit import JointFit, corrected_states, fit_jointly
 from snrmjax.identify.joint.notes import note_on_outlying, outlying_states
 from snrmjax.identify.pointwise.backbone import BackboneValues
@@ -231,11 +227,9 @@ def _note_on_gain(fit: JointFit) -> tuple[Note, ...]:
 
 
 def _note_on_advice(advice: NextMeasurements | None, options: IdentifyOptions) -> tuple[Note, ...]:
-    if advice is None or advice.status == AdviceStatus.COMPLETE:
+    if advice is None or advice.status.kind == "advice_complete":
         return ()
-    return (
-        Fact("fewer_advised", n=len(advice), wanted=options.further, why=advice.status.message),
-    )
+    return (Fact("fewer_advised", n=len(advice), wanted=options.further, why=advice.status),)
 
 
 def _each_once(notes: tuple[Note, ...]) -> tuple[Note, ...]:

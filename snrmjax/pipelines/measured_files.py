@@ -4,11 +4,8 @@ import dataclasses
 from pathlib import Path
 
 from snrmjax.io.files import FilePath, file_name, read_text
-from snrmjax.io.laboratory.reading import read_laboratory_file
-from snrmjax.io.laboratory.record_tables import (
-    is_record_table,
-    read_record_table,
-)
+from snrmjax.io.laboratory.reading import NOT_SEPARATED_TEXT, read_laboratory_file
+from snrmjax.io.laboratory.record_tables import is_record_table, read_record_table
 from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates
@@ -16,7 +13,6 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import InputError
 
 _STATES = {"level", "frequency_hz"}  # columns of which a table of steady states has one
-_NOT_CSV = (".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf", ".tdms", ".uff", ".unv", ".58")
 
 
 def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyStates | TimeRecording]:
@@ -27,7 +23,7 @@ def read_measured_test(path: FilePath, structure: Structure) -> list[SteadyState
     Raises `ValueError` as the readers do, and for a file with neither.
     """
     path = Path(path)
-    if path.suffix.lower() not in _NOT_CSV and _is_text(path):
+    if path.suffix.lower() not in NOT_SEPARATED_TEXT and _is_text(path):
         if is_record_table(path):
             return [read_record_table(path)]
         if _STATES & _header(path) or not _header(path):

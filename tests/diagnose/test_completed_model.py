@@ -7,7 +7,7 @@ import pytest
 from truths.balanced_sets import OMEGA, ZETA, balanced, linear_model
 
 import snrmjax as sj
-from snrmjax.diagnose.diagnosis_result import CompletedStatus, completed_model
+from snrmjax.diagnose.diagnosis_result import completed_model
 from snrmjax.io.models import read_model
 from snrmjax.pipelines.diagnose import diagnose_test
 from snrmjax.report.pages.diagnosis import write
@@ -26,7 +26,7 @@ def test_a_negative_damping_ratio_is_no_reason_to_lose_the_answer(tmp_path):
     found = test.diagnosis
     assert "quadratic_damping" in found.effects
     assert found.completed is None
-    assert found.answer.completed_status is CompletedStatus.NOT_PHYSICAL
+    assert not found.answer.extended
     (note,) = (note for note in found.notes if note.kind == "not_physical")
     assert "damping_ratio" in note["reason"]
     ratio = float(note["reason"].split("but is ")[1].rstrip("."))
@@ -44,11 +44,10 @@ def test_a_negative_frequency_is_refused_with_a_reason():
     kinds, values = ("linear_frequency_shift",), {"linear_frequency_shift.relative_shift": -1.4}
     refused = completed_model(linear_model(), {}, kinds, values)
     assert refused.model is None
-    assert refused.status is CompletedStatus.NOT_PHYSICAL
     assert "relative_shift" in refused.reason
     own = {"mode_1.natural_frequency": -3.0}
     below = completed_model(linear_model(), own, kinds, dict.fromkeys(values, 0.1))
-    assert below.status is CompletedStatus.NOT_PHYSICAL
+    assert below.model is None
     assert "natural_frequency" in below.reason
 
 
@@ -56,7 +55,7 @@ def test_a_model_that_lacks_nothing_stays_as_it_is():
     model = linear_model()
     found = completed_model(model, {"mode_1.damping_ratio": 0.02}, (), {})
     assert found.model is model
-    assert found.status is CompletedStatus.NOTHING_ADDED
+    assert not found.extended
 
 
 def test_a_completed_model_has_the_identified_effects(tmp_path):
@@ -66,7 +65,7 @@ def test_a_completed_model_has_the_identified_effects(tmp_path):
         ("cubic_stiffness",),
         {"cubic_stiffness.coefficient": 7.0},
     )
-    assert found.status is CompletedStatus.COMPLETED
+    assert found.extended
     sj.io.write_model(tmp_path / "model.toml", found.model)
     again = read_model(tmp_path / "model.toml")
     assert float(again.modes.damping_ratio[0]) == pytest.approx(0.02)

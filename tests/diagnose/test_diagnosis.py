@@ -22,12 +22,9 @@ from truths.balanced_sets import (
 
 import snrmjax as sj
 from snrmjax.diagnose.checks.residuals import withheld_level
+from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.misfit.candidates import candidate
-from snrmjax.diagnose.misfit.effect_fit import (
-    baseline_fit,
-    fit_effect,
-    with_propagated_errors,
-)
+from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect, with_propagated_errors
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.response_prediction import (
@@ -110,7 +107,7 @@ def test_where_nothing_is_hidden_nothing_is_found():
     assert found.effects == ()
     assert found.gap.after == found.gap.before == pytest.approx(1.0, abs=0.2)
     # Every searched effect has a detection limit.
-    searched = {kind for kind, effect in EFFECTS.items() if effect.searched}
+    searched = {kind for kind in EFFECTS if hypothesis_of(kind).searched}
     assert {name.partition(".")[0] for name in found.detection_limits} == searched
     assert not searched & {"close_mode", "static_preload"}
     assert all(0 < limit < np.inf for limit in found.detection_limits.values())

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from truths.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
-from snrmjax.diagnose.diagnosis_result import CompletedStatus, unit_of
+from snrmjax.diagnose.diagnosis_result import unit_of
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
@@ -31,9 +31,7 @@ def test_a_diagnosis_prints_on_one_screen(found):
 
 
 def test_a_model_that_stays_as_it_is_ends_so(found):
-    nothing = found.answer._replace(
-        status=MinimisationStatus.NOT_FITTED, completed_status=CompletedStatus.NOTHING_ADDED
-    )
+    nothing = found.answer._replace(status=MinimisationStatus.NOT_FITTED, extended=False)
     texts = repr(dataclasses.replace(found, answer=nothing, notes=()))
     assert texts.splitlines()[-1].strip() == "status: nothing was added to the model"
 

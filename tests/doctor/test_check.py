@@ -1,6 +1,7 @@
 """The import doctor on the exact responses of one mode, each with one error."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, rubbing_tes
 
 import snrmjax as sj
 from snrmjax.cli import app
+from snrmjax.doctor import findings
 from snrmjax.measure import Channel, time_recording
 
 
@@ -236,6 +238,22 @@ RECORDS = ("force_harmonics", "force_dropout", "missing_anti_alias", "clipped_ch
 @pytest.mark.parametrize("kind", RECORDS)
 def test_each_error_of_a_record_is_reported_alone(kind):
     assert set(raised(sj.doctor.check_test([], None, [record(kind)]))) == {kind}
+
+
+# Kinds of more than one file or column, by the file with their test.
+ELSEWHERE = {
+    "wrong_unit": "test_check.py",
+    "different_structures": "test_check.py",
+    "motion_of_base": "test_moving_bases_and_radians.py",
+}
+
+
+def test_every_kind_of_finding_is_produced_by_a_test():
+    missing = {*findings.KINDS} - {*KINDS, *RECORDS, *ELSEWHERE}
+    assert not missing, f"add {missing} to `broken` and KINDS, or to `record` and RECORDS, here."
+    for kind, file in ELSEWHERE.items():
+        text = Path(__file__).with_name(file).read_text("utf-8")
+        assert text.count(f'"{kind}"') > (file == Path(__file__).name), f"{file} lacks {kind}"
 
 
 def test_steps_that_end_too_soon():

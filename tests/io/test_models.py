@@ -392,18 +392,6 @@ def test_refuses(tmp_path, case, check_message):
     check_message(error, parts)
 
 
-def test_the_effects_are_those_of_the_format():
-    kinds = """
-        linear_frequency_shift linear_damping_change cubic_stiffness quadratic_stiffness
-        quintic_stiffness bilinear_stiffness gap_stiffness one_sided_stop coulomb_friction
-        jenkins_slider iwan_microslip quadratic_damping cubic_damping van_der_pol_damping
-        frequency_drift added_mass force_gain_error force_offset_error sensor_gain_error
-        sensor_phase_error internal_resonance_1_3 internal_resonance_1_2 residual_mode
-        mode_shape_change force_harmonics static_preload close_mode
-    """
-    assert sorted(EFFECTS) == sorted(kinds.split())
-
-
 def test_refuses_a_missing_file_and_a_folder(tmp_path, check_message):
     with pytest.raises(ValueError, match="does not exist") as error:
         read_model(tmp_path / "gone.toml")

@@ -1,35 +1,19 @@
 """Metadata of effects against their forces and their dimensions."""
 
 import re
-from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import Array
+from truths.kinds import dimension
+from truths.own_effects import OwnAsymmetry, OwnDrag
 
-from snrmjax.model.averaging import averaged_effect
-from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
-from snrmjax.model.effect_metadata import (
-    Argument,
-    MotionScales,
-    Part,
-    Prior,
-    Shape,
-    Symmetry,
-    parameter,
-)
-from snrmjax.model.effect_shape import computed_shape, shape_of, starts_of
+from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effect_metadata import Argument, Part, Shape, Symmetry
+from snrmjax.model.effect_shape import computed_shape, shape_of
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.model.library.confounders import CONFOUNDERS
-from snrmjax.numerics.rules import POSITIVE
 
 FORCES = [kind for kind, effect in EFFECTS.items() if issubclass(effect, AbstractForce)]
-SCALES = MotionScales(
-    amplitude=2e-4, largest=7e-4, frequency=300.0, stiffness=2000.0, receptance=1e-4,
-    smallest_force=0.3, damping_ratio=0.01,
-)  # fmt: skip
 
 
 # Contacts have a typical gap of 1 kg^1/2 m, which no motion looked at reaches.
@@ -49,35 +33,6 @@ def test_a_stated_shape_is_that_of_the_force(kind):
         assert result.power == pytest.approx(stated.power, abs=1e-3)
 
 
-@pytest.mark.parametrize("kind", [k for k in FORCES if EFFECTS[k].shape.factor is not None])
-def test_a_start_changes_the_dynamic_stiffness_plainly(kind):
-    """Five per cent of it, by the cycle's own integrals."""
-    (start,) = starts_of(EFFECTS[kind], SCALES)
-    effect = make_effect(kind, dict(zip(effect_parameters(kind), start, strict=True)))
-    average = averaged_effect(effect, jnp.array(SCALES.amplitude), jnp.array(SCALES.frequency))
-    change = np.hypot(average.stiffness, SCALES.frequency * average.damping)
-    # Coulomb's jump is smoothed: 5.1e-4 of its first harmonic.
-    assert change == pytest.approx(0.05 * SCALES.stiffness, rel=1e-3)
-
-
-@pytest.mark.parametrize("kind", EFFECTS)
-def test_starts_lie_inside_the_priors_and_priors_inside_the_rules(kind):
-    effect = EFFECTS[kind]
-    starts, bounds = starts_of(effect, SCALES), effect.bounds(SCALES)
-    parameters = effect.parameters()
-    assert tuple(parameters) == effect_parameters(kind)
-    for start in starts:
-        assert len(start) == len(bounds) == len(parameters)
-        steps = effect.steps(tuple(abs(value) for value in start))
-        assert len(steps) == len(start)
-        assert min(steps) > 0 or kind == "force_harmonics"
-        for value, (lower, upper), one in zip(start, bounds, parameters.values(), strict=True):
-            assert lower <= value <= upper
-            for bound in (max(lower, -1e200), min(upper, 1e200)):
-                assert all(rule.good(bound) for rule in one.rules)
-    make_effect(kind, dict(zip(parameters, starts[0], strict=True)))
-
-
 @pytest.mark.parametrize("kind", EFFECTS)
 def test_an_effect_is_described(kind):
     effect = EFFECTS[kind]
@@ -87,34 +42,6 @@ def test_an_effect_is_described(kind):
         assert one.unit
         assert one.meaning
     assert effect.shape is not None
-
-
-def test_every_confounder_has_effects():
-    assert len(set(CONFOUNDERS)) == len(CONFOUNDERS)
-    for one in CONFOUNDERS:
-        members = [kind for kind, effect in EFFECTS.items() if one in effect.confounders]
-        assert len(members) > 1 or one.by_itself
-    stated = {one for effect in EFFECTS.values() for one in effect.confounders}
-    assert stated == set(CONFOUNDERS)
-
-
-UNITS = {"kg": (1, 0, 0), "m": (0, 1, 0), "s": (0, 0, 1), "1": (0, 0, 0)}
-POWERS = {"": 1.0, "²": 2.0, "⁴": 4.0, "^1/2": 0.5}
-
-
-def dimension(unit, exponent):
-    """Exponents of kg, m and s of a unit as effects write it."""
-    unit = unit.replace("(kg^1/2 m)^(1-exponent)", "power")
-    above, *below = re.sub(r"\^1/2", "^½", unit).split("/")
-    total = np.zeros(3)
-    for sign, part in ((1, above), *((-1, part) for part in below)):
-        for word in part.strip("()").split():
-            if word == "power":
-                total += (1 - exponent) * np.array([0.5, 1, 0])
-                continue
-            name, power = re.fullmatch(r"(kg|m|s|1)(.*)", word.replace("^½", "^1/2")).groups()
-            total += sign * POWERS[power] * np.array(UNITS[name])
-    return total
 
 
 @pytest.mark.parametrize("kind", FORCES)
@@ -138,43 +65,6 @@ def test_units_are_the_dimensions_of_the_force(kind):
     assert np.any(np.asarray(force) != 0)
 
 
-@pytest.mark.parametrize("kind", EFFECTS)
-def test_without_strength_an_effect_does_nothing(kind):
-    effect = EFFECTS[kind].without_strength(300.0, 0.01)
-    if isinstance(effect, AbstractForce):
-        q = jnp.cos(2 * jnp.pi * jnp.arange(64) / 64)
-        np.testing.assert_array_equal(effect.cycle_force(q, -300.0 * jnp.roll(q, 16)), 0.0)
-    for name, one in effect.parameters().items():
-        assert all(rule.good(float(getattr(effect, name))) for rule in one.rules)
-
-
-class OwnDrag(AbstractMemoryless):
-    """f = c |q̇|^p sgn q̇: an effect of a user, who states units and a prior."""
-
-    kind: ClassVar[str] = "own_drag"
-    coefficient: Array = parameter("(kg^1/2 m/s)^(1-exponent)/s", prior=Prior(lower=0.0))
-    exponent: Array = parameter("1", rules=(POSITIVE,), prior=Prior(1.0, 3.0), typical=1.5)
-
-    def force(self, displacement, velocity):
-        """See `AbstractMemoryless.force`."""
-        speed = jnp.abs(velocity)
-        safe = jnp.where(speed > 0, speed, 1.0)
-        return (
-            self.coefficient * jnp.sign(velocity) * jnp.where(speed > 0, safe, 0) ** self.exponent
-        )
-
-
-class OwnAsymmetry(AbstractMemoryless):
-    """f = a q⁴, of which nothing is stated."""
-
-    kind: ClassVar[str] = "own_asymmetry"
-    coefficient: Array
-
-    def force(self, displacement, velocity):
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * displacement**4
-
-
 def test_what_a_user_does_not_state_follows_from_the_force():
     drag, even = shape_of(OwnDrag), shape_of(OwnAsymmetry)
     assert drag == Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY, pytest.approx(0.5))
@@ -182,19 +72,6 @@ def test_what_a_user_does_not_state_follows_from_the_force():
     wanted = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT, strength_order=2)
     assert even == wanted
     assert even.lowest_harmonic == 2
-    # The drag of the visible change has 1.1128 … of its first harmonic: see Γ functions.
-    ((coefficient, exponent),) = starts_of(OwnDrag, SCALES)
-    speed = SCALES.amplitude * SCALES.frequency
-    harmonic = 2 * np.mean(np.abs(np.cos(np.linspace(0, 2 * np.pi, 4097)[:-1])) ** 2.5)
-    assert exponent == 1.5
-    change = coefficient * harmonic * speed**1.5 / SCALES.amplitude
-    assert change == pytest.approx(SCALES.change, rel=1e-4)
-    # Even forces change the fundamental by their square, with either sign: as a q² does.
-    plus, minus = starts_of(OwnAsymmetry, SCALES)
-    assert plus[0] == -minus[0] > 0
-    ((square,), _) = starts_of(EFFECTS["quadratic_stiffness"], SCALES)
-    at = SCALES.amplitude
-    assert plus[0] * at**4 == pytest.approx(square * at**2, rel=1e-9)
 
 
 def test_slopes_pass_through_effects_with_parameters():

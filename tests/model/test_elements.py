@@ -133,16 +133,62 @@ def test_elements_are_no_candidates_of_a_diagnosis_but_printed_below_them(kind):
     assert kind not in candidates
 
 
-def test_a_preload_and_a_load_push_the_same_way():
-    # As weights: x = F/k on a spring k, and a stop 0.01 m away is reached by 0.33 of its force.
-    for kind, name in (("static_load", "load"), ("static_preload", "constant_force")):
-        push = sj.model.make_effect(kind, {name: 4.0}, at="x1")
-        stop = sj.model.make_effect("one_sided_stop", {"stiffness": 300.0, "gap": 0.01}, at="x1")
-        one = sj.model.builders.matrices.from_matrices(
-            [[1.0]], 0.01, [[100.0]], force="x1", effects=[push, stop]
-        )
-        (rest,) = sj.model.equilibria(one)
-        assert rest.displacement[0] == pytest.approx((4.0 + 3.0) / 400.0)  # m, as the mass is 1 kg
+def test_a_preload_at_a_point_pushes_in_the_positive_direction():
+    # As a weight: x = F/k on a spring k, and a stop 0.01 m away is reached by 0.33 of its force.
+    push = sj.model.make_effect("static_preload", {"constant_force": 4.0}, at="x1")
+    stop = sj.model.make_effect("one_sided_stop", {"stiffness": 300.0, "gap": 0.01}, at="x1")
+    one = sj.model.builders.matrices.from_matrices(
+        [[1.0]], 0.01, [[100.0]], force="x1", effects=[push, stop]
+    )
+    (rest,) = sj.model.equilibria(one)
+    assert rest.displacement[0] == pytest.approx((4.0 + 3.0) / 400.0)  # m, as the mass is 1 kg
+
+
+@pytest.mark.parametrize(
+    ("former", "given", "kind", "named"),
+    [
+        ("static_load", {"load": 4.0}, "static_preload", {"constant_force": 4.0}),
+        (
+            *("regularised_friction", {"force_limit": 2.0, "velocity": 0.1}),
+            *("regularised_friction", {"slip_force": 2.0, "velocity": 0.1}),
+        ),
+        ("coulomb_friction", {"slip_force": 2.0}, "coulomb_friction", {"force": 2.0}),
+    ],
+)
+def test_former_and_further_names_are_accepted(former, given, kind, named, tmp_path):
+    made = sj.model.make_effect(former, given, at="a")
+    lines = [
+        "[[effect]]",
+        f'kind = "{former}"',
+        'at = "a"',
+        *(f"{k} = {v}" for k, v in given.items()),
+    ]
+    model = tmp_path / "model.toml"
+    model.write_text(RIG + "\n".join(lines))
+    for effect in (made, sj.read_model(model).effects[0]):
+        assert effect.kind == kind
+        assert {name: float(getattr(effect, name)) for name in effect.parameters()} == named
+
+
+RIG = """[structure]
+points = ["a"]
+mass = [[1.0]]
+stiffness = [[2.0]]
+damping = [[0.01]]
+[force]
+at = "a"
+"""
+
+
+def test_names_that_contradict_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="static_load acts at points only"):
+        sj.model.make_effect("static_load", {"load": 1.0})
+    with pytest.raises(ValueError, match="two names of one parameter"):
+        sj.model.make_effect("coulomb_friction", {"force": 1.0, "slip_force": 1.0})
+    model = tmp_path / "model.toml"
+    model.write_text(RIG + '[[effect]]\nkind = "static_load"\nload = 1.0\n')
+    with pytest.raises(ValueError, match=r"model\.toml: static_load acts at points"):
+        sj.read_model(model)
 
 
 def test_a_linkage_is_a_spring_that_turns():

@@ -36,7 +36,8 @@ def test_every_fact_is_worded_from_values_that_it_has():
     stated, words = stated_facts(), wordings()
     assert stated
     for location, kind, names in stated:
-        assert kind in words, f"{location}: {kind!r} is in no table of report/sentences"
+        file = f"snrmjax/report/sentences/{location.partition('/')[0]}.py"
+        assert kind in words, f"{location}: {kind!r} has no entry in `SENTENCES` of {file}"
         if None in names:  # values given as a mapping
             continue
         wording = words[kind]
@@ -60,6 +61,14 @@ def test_templates_count_list_and_print_percentages(monkeypatch):
     monkeypatch.setattr("snrmjax.report.sentences.wordings", lambda: table)
     fact = Fact("example", n=1, levels=(1, 2, 5), fraction=0.0512)
     assert sentence(fact) == str(fact) == "1 state of levels 1, 2 and 5, 5.1 %"
+
+
+def test_a_fact_without_a_wording_names_kind_and_file(monkeypatch):
+    with pytest.raises(LookupError, match=r"'unheard_of' has no wording.*snrmjax/report/sentences"):
+        str(Fact("unheard_of"))
+    monkeypatch.setattr("snrmjax.report.sentences.wordings", lambda: {"example": "{n} rows"})
+    with pytest.raises(LookupError, match=r"'example' is worded with 'n', but has \['m'\]"):
+        str(Fact("example", m=1))
 
 
 def test_facts_compare_and_hash_by_kind_and_values():

@@ -5,7 +5,7 @@ import numpy as np
 import snrmjax.identify.test_model.states as test_states
 from snrmjax.diagnose.naming.hypotheses import best_hypotheses
 from snrmjax.diagnose.naming.parts import naming_of
-from snrmjax.diagnose.naming.readings import LinearTest, ModelMotion, readings_of
+from snrmjax.diagnose.readings import LinearTest, ModelMotion, readings_of
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 

@@ -6,11 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.diagnose.kinds.confounders import CONFOUNDERS
+from snrmjax.diagnose.kinds.hypothesis import Confounder
+from snrmjax.diagnose.kinds.registry import hypothesis_of, starts_of
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns
-from snrmjax.model.effect_metadata import Confounder, MotionScales
-from snrmjax.model.effect_shape import starts_of
+from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, effect_parameters
-from snrmjax.model.library.confounders import CONFOUNDERS
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
@@ -27,12 +28,13 @@ class EffectCandidate(NamedTuple):
 
 
 def candidate(kind: str, scales: MotionScales) -> EffectCandidate:
-    """Starts, units and bounds of a kind of effect, from its class."""
-    effect = EFFECTS[kind]
-    starts = tuple(tuple(float(v) for v in start) for start in starts_of(effect, scales))
-    lower, upper = zip(*effect.bounds(scales), strict=True)
-    unit = effect.steps(tuple(abs(v) if v else 1.0 for v in starts[0]))
-    return EffectCandidate(kind, starts, unit, lower, upper)
+    """Starts, units and bounds of a kind of effect."""
+    starts = tuple(tuple(float(v) for v in start) for start in starts_of(kind, scales))
+    priors = [of.prior.bounds(scales) for of in EFFECTS[kind].parameters().values()]
+    lower, upper = zip(*priors, strict=True)
+    unit = tuple(abs(v) if v else 1.0 for v in starts[0])
+    steps = hypothesis_of(kind).steps
+    return EffectCandidate(kind, starts, unit if steps is None else steps(unit), lower, upper)
 
 
 def parameter_labels(kind: str) -> tuple[str, ...]:
@@ -64,14 +66,14 @@ def decide_by(kinds: set[str], *, harmonics: bool) -> list[Fact | str]:
 
 def _confounders(kinds: Iterable[str]) -> list[Confounder]:
     """Confounders of some kinds: the library's in its order, then a user's."""
-    every = [confounder for kind in kinds for confounder in EFFECTS[kind].confounders]
+    every = [confounder for kind in kinds for confounder in hypothesis_of(kind).confounders]
     library = [one for one in CONFOUNDERS if one in every]
     return library + [one for one in dict.fromkeys(every) if one not in CONFOUNDERS]
 
 
 def _confounded(confounder: Confounder, kinds: Iterable[str]) -> set[str]:
     """Those of some kinds that a confounder concerns."""
-    return {kind for kind in kinds if confounder in EFFECTS[kind].confounders}
+    return {kind for kind in kinds if confounder in hypothesis_of(kind).confounders}
 
 
 class Coordinates(NamedTuple):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.diagnose.kinds.registry import without_strength
 from snrmjax.diagnose.misfit import programs
 from snrmjax.diagnose.misfit.candidates import candidate, motion_scales, parameter_labels
 from snrmjax.diagnose.misfit.noise_model import Magnitudes, magnitudes_of
@@ -301,7 +302,7 @@ def predictions_of(
     """
     model = dataclasses.replace(model, name="")  # the name would be static in the compiled programs
     records = _records(model, data, harmonics)
-    numbers = parameter_values(model)
+    numbers, kinds = parameter_values(model), EFFECTS if kinds is None else kinds
     return Predictions(
         model=model,
         given=model,
@@ -313,9 +314,7 @@ def predictions_of(
             name: (numbers[name], std)
             for name, std in (stated_stds(model) | _of_modal_mass(model, force_gain_std)).items()
         },
-        group=_with_effects(
-            model, motion_scales(model, records["chosen"]), EFFECTS if kinds is None else kinds
-        ),
+        group=_with_effects(model, motion_scales(model, records["chosen"]), kinds),
     )
 
 
@@ -389,7 +388,7 @@ def with_idle_effects(model: Structure, kinds: Sequence[str]) -> Structure:
     """The model with further effects at zero strength: the same physics."""
     modes, j = model.modes, model.modes.mode_of_interest
     mode = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
-    added = tuple(EFFECTS[kind].without_strength(*mode) for kind in kinds)
+    added = tuple(without_strength(kind, *mode) for kind in kinds)
     return dataclasses.replace(model, effects=(*model.effects, *added))
 
 

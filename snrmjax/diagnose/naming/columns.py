@@ -11,10 +11,9 @@ import jax
 import numpy as np
 from jaxtyping import Complex
 
-from snrmjax.diagnose.naming.laws import LAWS
-from snrmjax.diagnose.naming.readings import Readings
+from snrmjax.diagnose.kinds.registry import hypothesis_of, starts_of
+from snrmjax.diagnose.readings import Readings
 from snrmjax.model.effect_base import AbstractForce
-from snrmjax.model.effect_shape import starts_of
 from snrmjax.model.effects import EFFECTS, is_own, make_effect
 
 _SAMPLES, _AMPLITUDES = 256, 60  # for a user's own force
@@ -52,11 +51,11 @@ def hypothesis_columns(readings: Readings, kinds: Iterable[str]) -> list[Column]
     """The columns of some kinds of effects; kinds without columns are left out."""
     columns: list[Column] = []
     for kind in kinds:
-        if kind not in LAWS:
+        law = hypothesis_of(kind)
+        if law.change is None:
             columns += _of_own_force(readings, kind)
             continue
-        axes = LAWS[kind].axes
-        choices = LAWS[kind].choices if readings.harmonics else LAWS[kind].choices[:1]
+        axes, choices = law.axes, law.choices if readings.harmonics else law.choices[:1]
         intervals = [np.gradient(axis) for axis in axes]
         total = np.prod([np.sum(widths) for widths in intervals]) * max(len(choices), 1)
         for shape, widths in zip(
@@ -81,7 +80,7 @@ def _of_own_force(readings: Readings, kind: str) -> list[Column]:
     grid = np.geomspace(np.min(x), 1.0, _AMPLITUDES)
     q = readings.largest * grid[:, None] * np.cos(angle)
     rate = -readings.natural_frequency * readings.largest * grid[:, None] * np.sin(angle)
-    names, starts = tuple(effect.parameters()), starts_of(effect, readings.scales)
+    names, starts = tuple(effect.parameters()), starts_of(kind, readings.scales)
     columns = []
     for start in starts:
         law: Any = make_effect(kind, dict(zip(names, start, strict=True)))
@@ -104,7 +103,10 @@ def _column(
     widths: tuple[float, ...],
 ) -> list[Column]:
     """One column, or none if it changes nothing."""
-    law, higher = LAWS[kind], np.zeros((len(readings.harmonics), len(readings.force)), complex)
+    law = hypothesis_of(kind)
+    higher = np.zeros((len(readings.harmonics), len(readings.force)), complex)
+    if law.change is None:
+        return []
     change = law.change(readings, *shape)
     if law.higher is not None:
         for index, one in enumerate(readings.harmonics):
@@ -136,21 +138,11 @@ def _scaled(
 
 def parameters_of(readings: Readings, column: Column, strength: float) -> dict[str, float] | None:
     """The effect's parameters by name, in modal units; None if readings do not determine them."""
-    law, own = LAWS.get(column.kind), strength / column.scale
+    law, own = hypothesis_of(column.kind), strength / column.scale
     if column.start:
         values: tuple[float, ...] = (own * column.start[0], *column.start[1:])
-    elif law is None or law.parameters is None:
+    elif law.parameters is None:
         return None
     else:
         values = law.parameters(readings, own, *column.shape)
     return dict(zip(EFFECTS[column.kind].parameters(), map(float, values), strict=True))
-
-
-def is_instrument(kind: str) -> bool:
-    """Whether a kind is a measurement error, not a property of the structure."""
-    return kind in LAWS and LAWS[kind].of_instrument
-
-
-def odds_of(kind: str) -> float:
-    """Prior odds of a kind over a law of the library."""
-    return LAWS[kind].odds if kind in LAWS else 1.0

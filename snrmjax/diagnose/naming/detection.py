@@ -6,14 +6,14 @@ from collections.abc import Collection
 import numpy as np
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.naming.columns import hypothesis_columns, is_instrument, parameters_of
+from snrmjax.diagnose.kinds.registry import hypothesis_of, starts_of
+from snrmjax.diagnose.naming.columns import hypothesis_columns, parameters_of
 from snrmjax.diagnose.naming.evidence import detectable_strengths
 from snrmjax.diagnose.naming.parts import Naming
 from snrmjax.diagnose.naming.rows import Problem
-from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import VISIBLE_CHANGE, MotionScales
-from snrmjax.model.effect_shape import shape_of, starts_of
-from snrmjax.model.effects import EFFECTS, effect_parameters
+from snrmjax.model.effect_shape import shape_of
+from snrmjax.model.effects import EFFECTS, effect_class, effect_parameters
 
 
 def detection_limits(
@@ -26,7 +26,7 @@ def detection_limits(
     """
     known = [problem.columns[k] for k in naming.cell.columns]
     tried = {column.kind for column in problem.columns} - {*excluded, *naming.effects}
-    kinds = (kind for kind, effect in EFFECTS.items() if effect.searched and kind in tried)
+    kinds = (kind for kind in EFFECTS if kind in tried and hypothesis_of(kind).searched)
     # All shapes, not only those refined for these rows.
     problem = problem.with_columns([*known, *hypothesis_columns(problem.readings, kinds)])
     cell = naming.cell._replace(columns=tuple(range(len(known))))
@@ -36,7 +36,7 @@ def detection_limits(
     further = zip(problem.columns, strength.tolist(), strict=True)
     for column, by_rows in itertools.islice(further, len(known), None):
         kind, detectable = column.kind, by_rows
-        if not (is_instrument(kind) or np.any(column.higher)):
+        if not (hypothesis_of(kind).of_instrument or np.any(column.higher)):
             detectable = max(by_rows, smallest / float(np.max(np.abs(column.change))))
         sign = -1 if column.limits[1] <= 0 else 1
         values = parameters_of(problem.readings, column, sign * detectable)
@@ -49,16 +49,17 @@ def detection_limits(
     return limits
 
 
-def beyond_data(effect: type[AbstractEffect], limit: float, scales: MotionScales | None) -> bool:
+def beyond_data(kind: str, limit: float, scales: MotionScales | None) -> bool:
     """Whether the change by an effect at its detection limit exceeds ten times all measured.
 
     Arguments: `limit`: of its strength, in its own unit; `scales`: of the measured motions, without
     which only relative strengths are assessed.
     """
+    effect = effect_class(kind)
     unit = next(iter(effect.parameters().values())).unit
     if not np.isfinite(limit) or (unit == "1" and limit > priors.BEYOND_DATA):
         return True
-    starts = [] if scales is None else starts_of(effect, scales)
+    starts = [] if scales is None else starts_of(kind, scales)
     if not starts or not starts[0][0]:
         return False
     shape = shape_of(effect)

@@ -14,7 +14,8 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.special import log_ndtr, logsumexp
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.naming.columns import Column, odds_of
+from snrmjax.diagnose.kinds.registry import hypothesis_of
+from snrmjax.diagnose.naming.columns import Column
 from snrmjax.diagnose.naming.rows import (
     WITHOUT_LAWS,
     Cell,
@@ -70,7 +71,7 @@ class LawSums(NamedTuple):
         gram = block.across + white.T @ white
         base = -0.5 * float(gram[-1, -1]) - float(np.sum(np.log(np.diag(factor))))
         kinds = [column.kind for column in columns]
-        odds = {kind: odds_of(kind) for kind in dict.fromkeys(kinds)}
+        odds = {kind: hypothesis_of(kind).odds for kind in dict.fromkeys(kinds)}
         every = sum(odds.values())
         low, high = np.array([column.limits for column in columns]).reshape(-1, 2).T
         # A known sign doubles the prior density; other limits leave it as it is.

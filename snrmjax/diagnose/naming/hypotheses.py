@@ -16,12 +16,7 @@ from scipy.special import logsumexp
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column, hypothesis_columns
-from snrmjax.diagnose.naming.evidence import (
-    HarmonicSums,
-    LawSums,
-    remainder_stds,
-)
-from snrmjax.diagnose.naming.readings import Readings
+from snrmjax.diagnose.naming.evidence import HarmonicSums, LawSums, remainder_stds
 from snrmjax.diagnose.naming.rows import (
     WITHOUT_LAWS,
     Cell,
@@ -31,6 +26,7 @@ from snrmjax.diagnose.naming.rows import (
     RowBlock,
     problem_of,
 )
+from snrmjax.diagnose.readings import Readings
 from snrmjax.identify.test_model.priors import LEVELS
 
 _ROUNDS = 3  # of refined shapes

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose import priors
+from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.naming.assessed import DRAWN, Assessed, Laws, classes_of
-from snrmjax.diagnose.naming.columns import is_instrument, parameters_of
+from snrmjax.diagnose.naming.columns import parameters_of
 from snrmjax.diagnose.naming.rows import Cell, Problem, Solved, solved
 
 _CELLS = 100  # most probable hypotheses that are solved
@@ -222,7 +223,7 @@ def _assessed(
             matters = _rms(own) > priors.NEGLIGIBLE * whole and np.max(np.abs(own) / small) > 1
             if visible_laws[index] and matters and visible(own):
                 kinds.append(problem.columns[column].kind)
-        laws[part] = tuple(sorted(kind for kind in kinds if not is_instrument(kind)))
+        laws[part] = tuple(sorted(kind for kind in kinds if not hypothesis_of(kind).of_instrument))
         if part.startswith("harmonic"):  # instrument kinds (exciter harmonics) count here
             laws[part] = tuple(sorted(kinds))
     laws["instrument"] = tuple(
@@ -230,7 +231,7 @@ def _assessed(
             {
                 problem.columns[c].kind
                 for index, c in enumerate(cell.columns)
-                if visible_laws[index] and is_instrument(problem.columns[c].kind)
+                if visible_laws[index] and hypothesis_of(problem.columns[c].kind).of_instrument
             }
         )
     )
@@ -365,7 +366,9 @@ def _remainder(problem: Problem, assessed: list[Assessed], part: str, best: Asse
     order = np.argsort(readings.relative_amplitude)
     # Instrument errors are no curves of amplitude: states are corrected for them instead.
     kinds = [problem.columns[c].kind for c in best.cell.columns]
-    erring = np.array([part in DRAWN and is_instrument(kind) for kind in kinds], dtype=bool)
+    erring = np.array(
+        [part in DRAWN and hypothesis_of(kind).of_instrument for kind in kinds], dtype=bool
+    )
     at_states = change.of_law @ (change.strength * ~erring)
     laws = np.interp(x, readings.relative_amplitude[order], at_states[order])
     if part in DRAWN:

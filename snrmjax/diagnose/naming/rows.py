@@ -11,7 +11,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column
-from snrmjax.diagnose.naming.readings import Readings
+from snrmjax.diagnose.readings import Readings
 
 _KNOTS_A_UNIT = 8  # knots per unit of ln a
 _MOST_KNOTS = 40

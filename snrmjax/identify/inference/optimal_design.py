@@ -29,7 +29,6 @@ from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import Variable, setting
-from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
 
 Target = Literal["curves", "frequency", "damping"]
@@ -40,18 +39,6 @@ _PER_FORCE = 96  # candidate states of one force
 _TARGETS = 25  # amplitudes at which a band is evaluated
 _FROM_FOLD = 0.002  # smallest relative frequency distance of a state from a fold
 _FARTHEST = np.radians(70.0)  # from resonance: beyond it other errors dominate
-
-
-class AdviceStatus(Status):
-    """Outcome of the search for the next measurements."""
-
-    COMPLETE = 0, "as many states as requested"
-    FEWER_STATES = 1, "fewer candidate states than requested"
-    NO_STATE = (
-        2,
-        "no stable state of the fitted responses within 70° of resonance can be measured in this "
-        "range of forces, frequencies and measured amplitudes",
-    )
 
 
 class NextMeasurement(NamedTuple):
@@ -95,7 +82,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     responses: tuple[FittedResponse, ...]  # the main curves under the advised forces
     sensor: str = setting()
     target: str = setting()
-    status: AdviceStatus = setting()
+    status: Fact = setting()
     drive_known_only: bool = eqx.field(static=True)
     notes: tuple[Fact, ...] = setting(default=())
 
@@ -108,8 +95,8 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
             lines.append(f"{row.rank}: {state}: {row.reason}")
         if len(self) > _SHOWN:
             lines.append(f"and {len(self) - _SHOWN} more")
-        if self.status != AdviceStatus.COMPLETE:
-            lines.append(f"status: {self.status.message}")
+        if self.status.kind != "advice_complete":
+            lines.append(f"status: {self.status}")
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
@@ -121,7 +108,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {**super().attributes(), "status": self.status.message}
+        return {**super().attributes(), "status": str(self.status)}
 
 
 @on_numbers("Differentiate `sj.identify.refit`.")
@@ -161,13 +148,14 @@ def next_measurements(
     slopes, scale = _target(fit, target)
     advice = [] if states is None else _ranked(fit, states, slopes / scale[:, None], target, count)
     loads = {row.force for row in advice}
-    status = AdviceStatus.COMPLETE if len(advice) == count else AdviceStatus.FEWER_STATES
+    enough = len(advice) == count
+    status = Fact("advice_complete") if enough else Fact("fewer_candidates")
     return NextMeasurements(
         rows=tuple(advice),
         responses=() if states is None else tuple(c for c in states.curves if c.force in loads),
         sensor=fit.modes.sensors[fit.data.sensor],
         target=target,
-        status=status if states is not None else AdviceStatus.NO_STATE,
+        status=status if states is not None else Fact("no_state_to_measure"),
         drive_known_only=fit.drive_known_only,
         notes=() if fit.converged else (Fact("advice_of_unconverged_fit"),),
     )

@@ -136,7 +136,7 @@ def joined_files(files: Sequence[LaboratoryFile]) -> list[LaboratoryFile]:
     record, name = joined
     joined_note = [Fact("channels_of_files", files=tuple(recordings))]
     notes = tuple(dict.fromkeys([*joined_note, *(note for file in files for note in file.notes)]))
-    return [LaboratoryFile(name, files[0].kind, (record,), notes=notes)]
+    return [files[0]._replace(name=name, recordings=(record,), notes=notes)]
 
 
 def _datasets(

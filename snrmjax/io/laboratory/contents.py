@@ -1,7 +1,7 @@
 """Contents of a laboratory file of any format."""
 
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Num
@@ -10,8 +10,6 @@ from snrmjax.io.laboratory.names import column_unit, role_of
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
-
-Kind = Literal["uff", "matlab", "octave", "hdf5", "netcdf", "tdms", "lvm", "csv"]
 
 
 class NumberTable(NamedTuple):
@@ -60,16 +58,16 @@ class LaboratoryFile(NamedTuple):
     """Contents of a laboratory file; see `read_laboratory_file`.
 
     `levels` has one number for each of `responses` (UFF: the value on the z axis), NaN where the
-    file states none. `notes` report what was not read, and assumptions.
+    file states none. `notes` report what was not read, and assumptions. `kind` is the format.
     """
 
     name: str
-    kind: Kind
     recordings: tuple[TimeRecording, ...] = ()
     responses: tuple[FrequencyResponses, ...] = ()
     tables: tuple[NumberTable, ...] = ()
     notes: tuple[Fact, ...] = ()
     levels: tuple[float, ...] = ()
+    kind: str = ""  # by `read_laboratory_file`: readers of one format leave it open
 
     @property
     def is_empty(self) -> bool:

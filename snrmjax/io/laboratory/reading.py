@@ -1,30 +1,82 @@
 """One reader for all laboratory files: the format follows from content, then extension."""
 
 import importlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 from snrmjax.io.files import FilePath, file_name, read_bytes
 from snrmjax.io.laboratory.arrays.even_axis import EvenAxis
 from snrmjax.io.laboratory.arrays.matlab_files import is_old_matlab
 from snrmjax.io.laboratory.arrays.octave_text import is_octave_text
-from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
+from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.record_tables import with_named_channels
 from snrmjax.numerics.rules import InputError
 
 _ROOM = "snrmjax.io.laboratory"
-_READERS: dict[Kind, tuple[str, str]] = {
-    "uff": ("uff.functions", "read_uff"),
-    "matlab": ("arrays.matlab_files", "read_matlab"),
-    "octave": ("arrays.octave_text", "read_octave"),
-    "hdf5": ("arrays.hdf5_tree", "read_hdf5"),
-    "tdms": ("tdms_files", "read_tdms"),
-    "lvm": ("text.labview_text", "read_labview_text"),
-    "csv": ("text.separated_text", "read_separated_text"),
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_NETCDF = (".nc", ".nc4", ".cdf")
+
+
+class _Format(NamedTuple):
+    """A file format: its reader, with the option that it takes, and how it is recognised."""
+
+    reader: str
+    suffixes: tuple[str, ...]
+    recognised: Callable[[bytes, str], bool]  # by the first bytes and the suffix
+    option: Literal["axis", "text_format"] | None = None
+
+
+def _is_hdf5(head: bytes) -> bool:
+    return any(head[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048))  # after a user block
+
+
+def _is_netcdf(head: bytes, suffix: str) -> bool:
+    return _is_hdf5(head) and suffix in _NETCDF
+
+
+def _is_matlab(head: bytes, suffix: str) -> bool:
+    new = _is_hdf5(head) and (head.startswith(b"MATLAB 7.3") or suffix == ".mat")
+    return new or is_old_matlab(head, suffix)
+
+
+_READERS: dict[str, _Format] = {
+    "matlab": _Format("arrays.matlab_files.read_matlab", (".mat",), _is_matlab, "axis"),
+    "netcdf": _Format("arrays.hdf5_tree.read_hdf5", _NETCDF, _is_netcdf, "axis"),
+    "hdf5": _Format(
+        "arrays.hdf5_tree.read_hdf5", (".h5", ".hdf5"), lambda head, _: _is_hdf5(head), "axis"
+    ),
+    "tdms": _Format("tdms_files.read_tdms", (".tdms",), lambda head, _: head.startswith(b"TDSm")),
+    "octave": _Format(
+        "arrays.octave_text.read_octave", (), lambda head, _: is_octave_text(head), "axis"
+    ),
+    "lvm": _Format(
+        "text.labview_text.read_labview_text",
+        (".lvm",),
+        lambda head, _: head.lstrip(b"\xef\xbb\xbf\r\n ").startswith(b"LabVIEW Measurement"),
+    ),
+    "uff": _Format(
+        "uff.functions.read_uff",
+        (".uff", ".unv", ".unv58", ".58"),
+        lambda head, _: head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip() == b"    -1",
+    ),
+    "csv": _Format(
+        "text.separated_text.read_separated_text",
+        (".csv", ".tsv", ".dat", ".asc"),
+        lambda head, _: b"\0" not in head or head.startswith((b"\xff\xfe", b"\xfe\xff")),  # UTF-16
+        "text_format",
+    ),
 }
-_OF_ARRAYS = ("matlab", "octave", "hdf5")
+"""By kind, in the order in which they are tried: any text is a CSV."""
+
+SUFFIXES = tuple(suffix for one in _READERS.values() for suffix in one.suffixes)
+"""Suffixes of laboratory files, in small letters; content decides."""
+
+NOT_SEPARATED_TEXT = tuple(suffix for suffix in SUFFIXES if suffix not in _READERS["csv"].suffixes)
+"""Those of other formats than separated text."""
+
 _HEAD = 4096
 _MOST_REASONS = 6  # notes listed where nothing was read
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def read_laboratory_file(
@@ -42,41 +94,31 @@ def read_laboratory_file(
     and where the reader needs a package that is not installed.
     """
     kind = _kind(path)
-    module, function = _READERS[kind]
-    read = getattr(importlib.import_module(f"{_ROOM}.{module}"), function)
-    options = (text_format,) if kind == "csv" else (axis,) if kind in _OF_ARRAYS else ()
-    contents: LaboratoryFile = read(Path(path), *options)
+    form = _READERS[kind]
+    module, _, function = f"{_ROOM}.{form.reader}".rpartition(".")
+    read = getattr(importlib.import_module(module), function)
+    given = {"axis": axis, "text_format": text_format}
+    contents: LaboratoryFile = read(Path(path), *(given[form.option],) if form.option else ())
     if contents.is_empty:
         why = f": {' '.join(map(str, contents.notes[:_MOST_REASONS]))}" if contents.notes else "."
         raise InputError(f"{contents.name} holds nothing that could be read{why}")
     return contents._replace(
+        kind=kind,
         recordings=tuple(map(with_named_channels, contents.recordings)),
         tables=tuple(table.with_named_units() for table in contents.tables),
     )
 
 
-def _kind(path: FilePath) -> Kind:
+def _kind(path: FilePath) -> str:
     """The format of a file."""
     name, head = file_name(path), read_bytes(path, _HEAD)
     if not head:
         raise InputError(f"{name} is empty.")
-    if any(head[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048)):  # after a user block
-        matlab = head.startswith(b"MATLAB 7.3") or Path(path).suffix.lower() == ".mat"
-        return "matlab" if matlab else "hdf5"
-    if head.startswith(b"TDSm"):
-        return "tdms"
-    if is_old_matlab(head, Path(path).suffix):
-        return "matlab"
-    if is_octave_text(head):
-        return "octave"
-    if head.lstrip(b"\xef\xbb\xbf\r\n ").startswith(b"LabVIEW Measurement"):
-        return "lvm"
-    first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()
-    if first == b"    -1":
-        return "uff"
-    if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):  # UTF-16 text
-        raise InputError(f"{name} is of no known format ({_description(head)}).")
-    return "csv"
+    suffix = Path(path).suffix.lower()
+    for kind, form in _READERS.items():
+        if form.recognised(head, suffix):
+            return kind
+    raise InputError(f"{name} is of no known format ({_description(head)}).")
 
 
 def _description(head: bytes) -> str:

@@ -16,11 +16,7 @@ from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.physical_units import channel_meaning
 from snrmjax.io.laboratory.shared_clock import SharedAxis, TimeAxis, note_on_shift, shared_axes
 from snrmjax.measure.recordings.channels import Channel
-from snrmjax.measure.recordings.time_recording import (
-    AbstractSamples,
-    TimeRecording,
-    time_recording,
-)
+from snrmjax.measure.recordings.time_recording import AbstractSamples, TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
 
@@ -105,7 +101,7 @@ def read_tdms(path: Path) -> LaboratoryFile:
         tables.extend(table._replace(name=name) for table in contents.numbered())
         notes.extend(contents.notes)
     return LaboratoryFile(
-        path.name, "tdms", tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
+        path.name, tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
     )
 
 

@@ -1,10 +1,28 @@
-"""Numbers of used and omitted steps of a stepped sine, with reasons."""
+"""Which parts of a record gave a steady state, and the numbers of used and omitted ones."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.status import Status
+
+FEWEST_CYCLES = 10
+"""Cycles of a step that are evaluated, at least."""
+
+
+class RecordStatus(Status):
+    """Whether a step or a moment of a record gave a steady state, or why it did not."""
+
+    SETTLED = 0, "settled"
+    UNSETTLED = 1, "amplitude or phase still change at its end; dwell longer"
+    TOO_SHORT = 2, f"fewer than {FEWEST_CYCLES} cycles are left"
+    NOT_FINITE = 3, "samples are missing or not finite"
+    CLIPPED = 4, "a channel stays at its largest value: it is clipped"
+    NOT_FOUND = 5, "the frequency of the force differs from the table"
+    NO_FORCE = 6, "the force is a thousandth of the largest or less: a pause"
+    OUTSIDE = 7, "the window leaves the sweep, or samples are missing"
+    TOO_FAST = 8, "the phasor changes too fast for a steady state (a jump, or too fast a sweep)"
 
 
 class StepCounts(NamedTuple):

@@ -14,7 +14,7 @@ from snrmjax.measure.recordings.settling import (
     settled_part,
     steady_frequency,
 )
-from snrmjax.measure.recordings.step_counts import StepCounts
+from snrmjax.measure.recordings.step_counts import FEWEST_CYCLES, RecordStatus, StepCounts
 from snrmjax.measure.recordings.steps import Step, moves_within_steps, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import check_rate, track_tone
@@ -30,10 +30,8 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, quantity, setting
 from snrmjax.numerics.rules import InputError
-from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
 
-_FEWEST_CYCLES = 10
 _HIGHEST = 3  # least number of fitted harmonics, so that they do not count as noise
 _NEAR_TABLE = 0.5  # permitted error of a table's frequency, cycles over a step
 _BEYOND = 3.0  # times the median residual: the block extends beyond the step
@@ -41,18 +39,6 @@ _MOVES = 0.5  # drift within a step over the distance to the next: a sweep in pi
 _COVERED = 0.3  # least fraction of the time with a tone that steps cover
 _TRIES = 5  # candidate starts of the settled part
 _QUIET = 1e-3  # of the largest force: a pause
-
-
-class StepStatus(Status):
-    """Whether a step of a record gave a steady state, or why it did not."""
-
-    SETTLED = 0, "settled"
-    UNSETTLED = 1, "amplitude or phase still change at its end; dwell longer"
-    TOO_SHORT = 2, f"fewer than {_FEWEST_CYCLES} cycles are left"
-    NOT_FINITE = 3, "samples are missing or not finite"
-    CLIPPED = 4, "a channel stays at its largest value: it is clipped"
-    NOT_FOUND = 5, "the frequency of the force differs from the table"
-    NO_FORCE = 6, "the force is a thousandth of the largest or less: a pause"
 
 
 class SteppedSineStates(AbstractResult):
@@ -78,7 +64,7 @@ class SteppedSineStates(AbstractResult):
         "step", "1", "scatter of blocks over white noise's"
     )
     state: Int[np.ndarray, " step"] = quantity("step", "1", "row of the steady states, -1: none")
-    status: Int[np.ndarray, " step"] = quantity("step", "", "whether it settled", of=StepStatus)
+    status: Int[np.ndarray, " step"] = quantity("step", "", "whether it settled", of=RecordStatus)
     notes: tuple[Fact | str, ...] = setting(default=())
 
     @property
@@ -86,8 +72,8 @@ class SteppedSineStates(AbstractResult):
         """Numbers of used steps, and of omitted ones by reason."""
         left = {
             kind.name.lower().replace("_", " "): int(np.sum(self.status == int(kind)))
-            for kind in StepStatus
-            if kind is not StepStatus.SETTLED and np.any(self.status == int(kind))
+            for kind in RecordStatus
+            if kind is not RecordStatus.SETTLED and np.any(self.status == int(kind))
         }
         return StepCounts(self.states.n_states, left)
 
@@ -96,7 +82,7 @@ class _Measured(NamedTuple):
     """The evaluation of one step."""
 
     step: Step
-    status: StepStatus
+    status: RecordStatus
     settled_from: float = np.nan
     decay_time: float = np.nan
     moved: float = np.nan
@@ -191,11 +177,11 @@ def _recognised(
         least_amplitude_step=amplitude_step,
         least_step=frequency_step,
     )
-    long = [step for step in steps if _cycles(recording, step) >= _FEWEST_CYCLES]
+    long = [step for step in steps if _cycles(recording, step) >= FEWEST_CYCLES]
     if sum(step.stop - step.start for step in long) < _COVERED * np.ptp(track.middle):
         raise InputError(
             f"the record has no steps: the tone of channel {name} does not dwell at one frequency "
-            f"for {_FEWEST_CYCLES} cycles anywhere (a sweep? `sweep_states` reads it)."
+            f"for {FEWEST_CYCLES} cycles anywhere (a sweep? `sweep_states` reads it)."
         )
     if len(long) == 1:
         raise InputError(
@@ -268,22 +254,22 @@ def _measure(
     """Evaluate one step."""
     if settle is not None and not 0 <= settle < np.inf:
         raise InputError(f"`settle` must be a time of 0 s or more, but is {settle:g}.")
-    if _cycles(recording, step) < _FEWEST_CYCLES:
-        return _Measured(step, StepStatus.TOO_SHORT)
+    if _cycles(recording, step) < FEWEST_CYCLES:
+        return _Measured(step, RecordStatus.TOO_SHORT)
     below = np.pi * recording.sampling_rate / step.frequency
     highest = max(*orders, min(_HIGHEST, int(np.ceil(below) - 1)))
     blocks = block_phasors(recording, chosen.names, step.start, step.stop, step.frequency, highest)
     if not np.isfinite(blocks.phasors).all():
-        return _Measured(step, StepStatus.NOT_FINITE)
+        return _Measured(step, RecordStatus.NOT_FINITE)
     if blocks.clipped:
-        return _Measured(step, StepStatus.CLIPPED)
+        return _Measured(step, RecordStatus.CLIPPED)
     guide = chosen.names.index(chosen.drive) if chosen.drive is not None else 0
     if not of_table:
         blocks = _within_step(blocks, guide)
     shift = steady_frequency(blocks, guide)
     dwell = (step.stop - step.start) / recording.sampling_rate
     if of_table and abs(shift) * dwell > HERTZ * _NEAR_TABLE:
-        return _Measured(step, StepStatus.NOT_FOUND)
+        return _Measured(step, RecordStatus.NOT_FOUND)
     blocks = blocks.shifted(shift)
     step = step._replace(frequency=blocks.frequency)
     motion = _without_drive(blocks, chosen)
@@ -295,8 +281,8 @@ def _measure(
         if moved == 0:
             break
     each = (blocks.time[-1] - blocks.time[0]) / max(len(blocks.time) - 1, 1)
-    if len(kept.time) * each * step.frequency < HERTZ * _FEWEST_CYCLES / 2 or len(kept.time) < 3:
-        return _Measured(step, StepStatus.TOO_SHORT)
+    if len(kept.time) * each * step.frequency < HERTZ * FEWEST_CYCLES / 2 or len(kept.time) < 3:
+        return _Measured(step, RecordStatus.TOO_SHORT)
     means = mean_phasors(kept)
     transient = part.remaining[:, first]
     fraction = float(np.max(transient / np.abs(means.phasors[:, 0])))
@@ -304,7 +290,7 @@ def _measure(
     unsettled = moved > 0 or fraction > tolerance
     return _Measured(
         step._replace(amplitude=float(np.abs(means.phasors[0, 0]))),
-        StepStatus.UNSETTLED if unsettled else StepStatus.SETTLED,
+        RecordStatus.UNSETTLED if unsettled else RecordStatus.SETTLED,
         np.nan if unsettled else begins,
         part.decay_time,
         max(moved, fraction),
@@ -340,7 +326,7 @@ def _without_pauses(measured: list[_Measured]) -> list[_Measured]:
     amplitudes = [fitted.step.amplitude for fitted in measured]
     largest = max((a for a in amplitudes if np.isfinite(a)), default=0.0)
     return [
-        fitted._replace(status=StepStatus.NO_FORCE, settled_from=np.nan)
+        fitted._replace(status=RecordStatus.NO_FORCE, settled_from=np.nan)
         if fitted.means is not None and fitted.step.amplitude <= _QUIET * largest
         else fitted
         for fitted in measured
@@ -355,21 +341,21 @@ def _result(
     level: Levels | int,
 ) -> SteppedSineStates:
     status = np.array([int(fitted.status) for fitted in measured])
-    good = [fitted for fitted in measured if fitted.status is StepStatus.SETTLED]
+    good = [fitted for fitted in measured if fitted.status is RecordStatus.SETTLED]
     if not good:
         reasons = "; ".join(
             f"{np.sum(status == int(kind))} because {kind.message}"
-            for kind in StepStatus
+            for kind in RecordStatus
             if np.any(status == int(kind))
         )
-        moving = np.isin(status, (int(StepStatus.UNSETTLED), int(StepStatus.TOO_SHORT))).all()
+        moving = np.isin(status, (int(RecordStatus.UNSETTLED), int(RecordStatus.TOO_SHORT))).all()
         hint = " (a sweep? `sweep_states` reads it)" if moving else ""
         raise InputError(
             f"none of the {len(measured)} steps of the record settled: {reasons}{hint}."
         )
     states = states_of_phasors(recording, chosen, _table(good), orders, level)
     number = np.full(len(measured), -1)
-    number[status == int(StepStatus.SETTLED)] = np.arange(len(good))
+    number[status == int(RecordStatus.SETTLED)] = np.arange(len(good))
     rate, begin = recording.sampling_rate, recording.start_time
     return SteppedSineStates(
         states,

@@ -7,13 +7,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from snrmjax.measure.recordings.step_counts import RecordStatus
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.recordings.tone_track import (
-    ToneTrack,
-    check_rate,
-    track_tone,
-    unwrapped_phase,
-)
+from snrmjax.measure.recordings.tone_track import ToneTrack, check_rate, track_tone, unwrapped_phase
 from snrmjax.measure.recordings.velocity_states import (
     ChosenChannels,
     Levels,
@@ -37,7 +33,6 @@ from snrmjax.measure.sweeps.swept_table import (
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.rules import POSITIVE, InputError, require
-from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import HERTZ
 
 _START = 60  # states per sweep before refinement where the response changes
@@ -45,15 +40,6 @@ _CHORD = 0.08  # of the largest response between neighbouring states
 _ROUNDS = 3
 _MUCH = 0.3  # largest correction, of the force
 _BLURRED = 0.1  # relative error of a phasor above which the window is too wide
-
-
-class SweepStatus(Status):
-    """Whether a moment of a sweep gave a steady state, or why it did not."""
-
-    FOUND = 0, "found"
-    OUTSIDE = 1, "the window leaves the sweep, or samples are missing"
-    TOO_FAST = 2, "the phasor changes too fast for a steady state (a jump, or too fast a sweep)"
-    CLIPPED = 3, "a channel stays at its largest value: it is clipped"
 
 
 class SweptStates(AbstractResult):
@@ -241,7 +227,7 @@ def _result(
     correct: bool,
 ) -> SweptStates:
     moments, status = _moments(reader.chosen, passed)
-    left_out = [status.count(kind) for kind in SweepStatus]
+    left_out = [status.count(kind) for kind in RecordStatus]
     if moments:
         along = _moments(reader.chosen, grids)[0] or moments
         reference = reference_response(along)
@@ -250,12 +236,12 @@ def _result(
         force, force_std = steady_force(moments, reference, balance, corrected)
         fraction = 1 - force / np.array([moment.phasors.series[0, 0] for moment in moments])
         slow = np.abs(fraction) <= _MUCH
-        left_out[int(SweepStatus.TOO_FAST)] += int(np.sum(~slow))
+        left_out[int(RecordStatus.TOO_FAST)] += int(np.sum(~slow))
     if not moments or not slow.any():
         reasons = "; ".join(
             f"{count} because {kind.message}"
-            for kind, count in zip(SweepStatus, left_out, strict=True)
-            if count and kind is not SweepStatus.FOUND
+            for kind, count in zip(RecordStatus, left_out, strict=True)
+            if count and kind is not RecordStatus.SETTLED
         )
         default = "none passes the wanted frequencies, or samples are missing there"
         raise InputError(f"the sweeps give no steady state: {reasons or default}.")
@@ -299,27 +285,27 @@ def _facts_of_sweeps(
         )
     return facts + [
         Fact("moments_left_out", count=count, status=kind)
-        for kind, count in zip(SweepStatus, left_out, strict=True)
-        if count and kind is not SweepStatus.FOUND
+        for kind, count in zip(RecordStatus, left_out, strict=True)
+        if count and kind is not RecordStatus.SETTLED
     ]
 
 
 def _moments(
     chosen: ChosenChannels, passed: list[list[tuple[float, SweptPhasors | None]]]
-) -> tuple[list[Moment], list[SweepStatus]]:
+) -> tuple[list[Moment], list[RecordStatus]]:
     """States that can be read, and the status of every moment."""
     moments, status = [], []
     for k, run in enumerate(passed):
         for _, phasors in run:
             if phasors is None:
-                status.append(SweepStatus.OUTSIDE)
+                status.append(RecordStatus.OUTSIDE)
             elif phasors.clipped:
-                status.append(SweepStatus.CLIPPED)
+                status.append(RecordStatus.CLIPPED)
             else:
                 moment = swept_moment(chosen, k, phasors)
                 error = np.min(phasors.std[1:, 0] / np.abs(phasors.series[1:, 0]))
                 blurred = not error < _BLURRED
-                status.append(SweepStatus.TOO_FAST if blurred else SweepStatus.FOUND)
+                status.append(RecordStatus.TOO_FAST if blurred else RecordStatus.SETTLED)
                 moments += [] if blurred else [moment]
     return moments, status
 

@@ -6,16 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.model.effect_base import AbstractMemoryless, Scalar
-from snrmjax.model.effect_metadata import (
-    NON_NEGATIVE,
-    Argument,
-    Confounder,
-    Part,
-    Shape,
-    Symmetry,
-    parameter,
-)
-from snrmjax.model.library.confounders import SEPARATED_BY_THIRD_HARMONIC
+from snrmjax.model.effect_metadata import NON_NEGATIVE, Argument, Part, Shape, Symmetry, parameter
 
 _OF_VELOCITY = Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY)
 
@@ -30,7 +21,6 @@ class QuadraticDamping(AbstractMemoryless):
     shape: ClassVar[Shape] = _OF_VELOCITY._replace(
         power=1, factor=8 / (3 * np.pi), frequency_power=2
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg^1/2 m)", "quadratic damping", prior=NON_NEGATIVE)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -45,7 +35,6 @@ class CubicDamping(AbstractMemoryless):
         "A damping force cubic in the velocity, as of some dampers and seals."
     )
     shape: ClassVar[Shape] = _OF_VELOCITY._replace(power=2, factor=0.75, frequency_power=3)
-    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("s/(kg m²)", "cubic damping")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -63,7 +52,6 @@ class VanDerPolDamping(AbstractMemoryless):
     shape: ClassVar[Shape] = Shape(
         Part.DAMPING, Symmetry.ODD, Argument.BOTH, power=2, factor=0.25, frequency_power=1
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_THIRD_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg m² s)", "damping per squared displacement")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:

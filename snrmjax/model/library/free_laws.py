@@ -6,23 +6,14 @@ that the force is exactly zero at rest; beyond the last one f is extrapolated li
 form a power of x, dry friction and a contact are all smooth.
 """
 
-import dataclasses
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless, Scalar, Starts
-from snrmjax.model.effect_metadata import (
-    Argument,
-    Entries,
-    MotionScales,
-    Part,
-    Shape,
-    Symmetry,
-    parameter,
-)
+from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless, Scalar
+from snrmjax.model.effect_metadata import Argument, Entries, Part, Shape, Symmetry, parameter
 from snrmjax.model.library.friction import AbstractSliders, Sliders
 from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE
 
@@ -62,21 +53,8 @@ def drawn_force(x: Scalar, knots: Knots, force: Knots, reversed_force: Knots) ->
 class AbstractLaw(AbstractEffect):
     """A law given by a table of knots in place of a formula with few parameters.
 
-    A diagnosis estimates it from the data; it has no starting values of a fit.
+    A diagnosis estimates it from the data.
     """
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        return []
-
-    def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
-        """The same knots with zero force."""
-        values = {
-            name: 0.0 * getattr(self, name)
-            for name, parameter in self.parameters().items()
-            if parameter.entries is Entries.VALUES
-        }
-        return dataclasses.replace(self, **values)
 
 
 def _displacements() -> Any:

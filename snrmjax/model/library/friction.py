@@ -20,25 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from snrmjax.model.effect_base import (
-    AbstractHysteresis,
-    Samples,
-    Scalar,
-    Starts,
-    States,
-)
+from snrmjax.model.effect_base import AbstractHysteresis, Samples, Scalar, States
 from snrmjax.model.effect_metadata import (
     NON_NEGATIVE,
     Argument,
-    Confounder,
-    MotionScales,
     Part,
     Prior,
     Shape,
     Symmetry,
     parameter,
 )
-from snrmjax.model.library.confounders import FRICTION_OR_FORCE_OFFSET
 from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE, InputError
 
 _SLIP = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
@@ -193,12 +184,6 @@ class JenkinsSlider(AbstractSliders):
         prior=Prior(1e-3, 1.2, lambda scales: scales.largest),
     )
 
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """Slip at several fractions of the largest amplitude."""
-        fractions = (0.05, 0.15, 0.3, 0.5, 0.75)
-        return [(3.0 * scales.change, fraction * scales.largest) for fraction in fractions]
-
     def sliders(self) -> Sliders:
         return Sliders(jnp.asarray(self.stiffness)[None], jnp.asarray(self.slip_displacement)[None])
 
@@ -237,11 +222,6 @@ class IwanMicroslip(AbstractSliders):
         typical=1.5,
     )
     largest_slip: Scalar | None = None  # kg^1/2 m, of the sliders for time integration
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """Several exponents p, with Δ(ω̃²) ≈ −cQ^(p−1)."""
-        return [(scales.change / scales.amplitude ** (p - 1), p) for p in (1.2, 1.5, 2.0, 2.6)]
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
         return self.with_thresholds(displacement)
@@ -324,7 +304,6 @@ class CoulombFriction(AbstractHysteresis):
     shape: ClassVar[Shape] = Shape(
         Part.DAMPING, Symmetry.ODD, Argument.VELOCITY, power=-1, factor=4 / np.pi
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (FRICTION_OR_FORCE_OFFSET,)
     force: Scalar = parameter(
         "kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,), prior=NON_NEGATIVE
     )

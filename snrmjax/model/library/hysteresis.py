@@ -155,7 +155,7 @@ class FrictionContact(AbstractHysteresis):
 
     N = max(N₀ + k_n x_n, 0) with the compression x_n at `normal_at`; in tangential direction, at
     `at`, f = k_t (x − z) with |f| ≤ μN. The normal force on the structure is N − N₀: the `preload`
-    N₀ is in equilibrium at rest. Without a preload a `static_load` may close the contact. The
+    N₀ is in equilibrium at rest. Without a preload a `static_preload` may close the contact. The
     stability of motions with it is not computed.
     `stiffness` k_t, `normal_stiffness` k_n, `friction` μ, `preload` N₀.
 

@@ -1,30 +1,34 @@
 """Internal resonances: an added mode driven by the mode of interest through the potential."""
 
 import dataclasses
-from typing import ClassVar, Self
+from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from snrmjax.model.effect_base import AbstractAddedMode, Bounds, Scalar, Starts
+from snrmjax.model.effect_base import AbstractAddedMode, Scalar
 from snrmjax.model.effect_metadata import (
     ADDED_MODE_DAMPING,
-    Confounder,
-    MotionScales,
     Part,
+    Prior,
     Shape,
     Symmetry,
     parameter,
 )
-from snrmjax.model.library.confounders import WHICH_RESONANCE
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import Monomial, PolynomialPotential
 from snrmjax.numerics.rules import OF_A_DAMPING_RATIO, OF_A_FREQUENCY
 from snrmjax.numerics.units import HERTZ
 
-_NEAR = (0.8, 1.2)  # bounds of the added mode's frequency over the multiple of ω₀
+
+def _added_frequency(order: int) -> Any:
+    """The added mode's frequency, within a fifth of `order` times that of the mode of interest."""
+    return parameter(
+        *("Hz", "natural frequency of the added mode"),
+        rules=OF_A_FREQUENCY,
+        prior=Prior(0.8 * order, 1.2 * order, lambda scales: scales.frequency / HERTZ),
+    )
 
 
 class AbstractInternalResonance(AbstractAddedMode):
@@ -35,46 +39,14 @@ class AbstractInternalResonance(AbstractAddedMode):
     """
 
     order: ClassVar[int]  # n: cycles of the added mode per cycle of the mode of interest
-    confounders: ClassVar[tuple[Confounder, ...]] = (WHICH_RESONANCE,)
     coefficient: Scalar
-    frequency_hz: Scalar = parameter(
-        "Hz", "natural frequency of the added mode", rules=OF_A_FREQUENCY
-    )
+    frequency_hz: Scalar
     damping_ratio: Scalar = parameter(
         "1",
         "damping ratio of the added mode",
         rules=OF_A_DAMPING_RATIO,
         prior=ADDED_MODE_DAMPING,
     )
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """Added modes at and near n times the frequency.
-
-        At resonance q_new ~ bQⁿ/(2ⁿ⁻¹·2ζω²), with the reaction n b Qⁿ⁻² q_new on Q."""
-        n, hz = cls.order, scales.frequency / HERTZ
-        coupling = np.sqrt(scales.change * 0.02 * (n * scales.frequency) ** 2)
-        coupling = float(coupling / scales.amplitude ** (n - 1))
-        fractions = (0.95, 0.985, 1.0, 1.015, 1.05)
-        return [(coupling, n * hz * fraction, scales.damping_ratio) for fraction in fractions]
-
-    @classmethod
-    def bounds(cls, scales: MotionScales) -> Bounds:
-        """The added mode lies near n times the frequency."""
-        hz = cls.order * scales.frequency / HERTZ
-        free, _, damped = super().bounds(scales)
-        return [free, (_NEAR[0] * hz, _NEAR[1] * hz), damped]
-
-    @classmethod
-    def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
-        coefficient, hz, ratio = start
-        return abs(coefficient), 0.01 * hz, 0.5 * ratio
-
-    @classmethod
-    def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
-        """The added mode a tenth above n times ω₀."""
-        hz = 1.1 * cls.order * natural_frequency / HERTZ
-        return cls(*jax.device_put([np.asarray(value) for value in (0.0, hz, damping_ratio)]))
 
     def expanded(
         self, modes: LinearModes, potential: PolynomialPotential
@@ -107,8 +79,9 @@ class InternalResonanceOneToThree(AbstractInternalResonance):
         "draws energy from the mode of interest."
     )
     shape: ClassVar[Shape] = Shape(Part.HARMONICS, Symmetry.ODD, strength_order=2)
-    coefficient: Scalar = parameter("1/(kg m² s²)", "coupling of the two modes")
     order: ClassVar[int] = 3
+    coefficient: Scalar = parameter("1/(kg m² s²)", "coupling of the two modes")
+    frequency_hz: Scalar = _added_frequency(3)
 
 
 class InternalResonanceOneToTwo(AbstractInternalResonance):
@@ -120,8 +93,9 @@ class InternalResonanceOneToTwo(AbstractInternalResonance):
         "energy from the mode of interest."
     )
     shape: ClassVar[Shape] = Shape(Part.HARMONICS, Symmetry.EVEN, strength_order=2)
-    coefficient: Scalar = parameter("1/(kg^1/2 m s²)", "coupling of the two modes")
     order: ClassVar[int] = 2
+    coefficient: Scalar = parameter("1/(kg^1/2 m s²)", "coupling of the two modes")
+    frequency_hz: Scalar = _added_frequency(2)
 
 
 def _padded(values: Array | None, axes: int = 1) -> Array | None:

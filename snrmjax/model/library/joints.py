@@ -14,18 +14,18 @@ from snrmjax.numerics.rules import ABOVE_MINUS_ONE, NOT_NEGATIVE, POSITIVE
 class RegularisedFriction(AbstractMemoryless):
     """f = F tanh(ẋ/v): regularised dry friction, which creeps below the velocity v.
 
-    `force_limit` F and `velocity` v, a property of the model, not of the motion: below it the
+    `slip_force` F and `velocity` v, a property of the model, not of the motion: below it the
     friction is a damper F/v. Coulomb's law itself is `coulomb_friction`.
     """
 
     kind: ClassVar[str] = "regularised_friction"
     description: ClassVar[str] = "Dry friction whose jump is smoothed over a given velocity."
     shape: ClassVar[Shape] = Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY)
-    force_limit: Scalar = parameter("kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,))
+    slip_force: Scalar = parameter("kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,))
     velocity: Scalar = parameter("kg^1/2 m/s", "velocity of the jump", rules=(POSITIVE,))
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        return self.force_limit * jnp.tanh(velocity / self.velocity)
+        return self.slip_force * jnp.tanh(velocity / self.velocity)
 
 
 class SpringLinkage(AbstractMemoryless):
@@ -47,23 +47,6 @@ class SpringLinkage(AbstractMemoryless):
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         now = jnp.sqrt(self.length**2 + displacement**2)
         return self.stiffness * displacement * (1 - self.free_length / now)
-
-
-class StaticLoad(AbstractMemoryless):
-    """A constant force F on the structure along +x, such as a weight: f = −F; `load` is F.
-
-    Equal to `static_preload` of the same value at points.
-    """
-
-    kind: ClassVar[str] = "static_load"
-    description: ClassVar[str] = (
-        "A constant force along the positive direction, in addition to the driving force."
-    )
-    shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT)
-    load: Scalar = parameter("kg^1/2 m/s²", "constant load")
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        return -self.load + 0.0 * displacement
 
 
 class FourParameterIwan(AbstractSliders):

@@ -5,14 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from snrmjax.model.effect_base import AbstractLinearChange, Scalar
-from snrmjax.model.effect_metadata import (
-    POSITIVE_FACTOR,
-    Confounder,
-    Part,
-    Shape,
-    parameter,
-)
-from snrmjax.model.library.confounders import DRIFT, STIFFNESS_OR_MASS
+from snrmjax.model.effect_metadata import POSITIVE_FACTOR, Part, Shape, parameter
 from snrmjax.numerics.rules import ABOVE_MINUS_ONE
 
 
@@ -34,7 +27,6 @@ class LinearFrequencyShift(AbstractLinearChange):
         "the linear test."
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
-    confounders: ClassVar[tuple[Confounder, ...]] = (STIFFNESS_OR_MASS,)
     relative_shift: Scalar = parameter(
         "1",
         "relative shift of the natural frequency",
@@ -60,7 +52,6 @@ class FrequencyDrift(AbstractLinearChange):
         "The natural frequency drifts during the test, with temperature or as a joint settles."
     )
     shape: ClassVar[Shape] = Shape(Part.TIME)
-    confounders: ClassVar[tuple[Confounder, ...]] = (DRIFT,)
     relative_drift: Scalar = parameter(
         "1",
         "relative shift of the natural frequency over the test",
@@ -101,8 +92,6 @@ class AddedMass(AbstractLinearChange):
         "A mass missing in the model, such as that of a sensor or of a shaker's armature."
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
-    confounders: ClassVar[tuple[Confounder, ...]] = (STIFFNESS_OR_MASS,)
-    like_force_gain: ClassVar[bool] = True
     mass: Scalar = parameter(
         "1",
         "mass over the modal mass",

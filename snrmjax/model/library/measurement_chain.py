@@ -1,42 +1,25 @@
 """Errors of the excitation and the instruments, and modes missing in the model."""
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from snrmjax.model.effect_base import (
-    AbstractForceSpectrum,
-    AbstractMeasurementEffect,
-    Scalar,
-    Starts,
-)
+from snrmjax.model.effect_base import AbstractForceSpectrum, AbstractMeasurementEffect, Scalar
 from snrmjax.model.effect_metadata import (
     ADDED_MODE_DAMPING,
     POSITIVE_FACTOR,
     VISIBLE_CHANGE,
-    Confounder,
-    MotionScales,
     Part,
     Prior,
     Shape,
     parameter,
 )
-from snrmjax.model.library.confounders import (
-    FAR_MODE_OR_PHASE_ERROR,
-    FORCE_OR_SENSOR_GAIN,
-    FRICTION_OR_FORCE_OFFSET,
-    FURTHER_MODE,
-    RESPONSE_SCALE,
-    STRUCTURE_OR_FORCE_SPECTRUM,
-)
 from snrmjax.numerics.rules import ABOVE_MINUS_ONE, OF_A_DAMPING_RATIO, OF_A_FREQUENCY
 from snrmjax.numerics.units import DEGREE, HERTZ
 
 _SCALE = "scale of the response"
-_LIGHT = 1e-3  # damping ratio of a close mode if that of the model is zero
 _WIDE = 0.15  # relative distance in frequency, beyond which a mode counts as a residual one
 _RELATIVE: dict[str, Any] = {  # bounds and starting value of a relative error
     "rules": (ABOVE_MINUS_ONE,),
@@ -55,7 +38,6 @@ class ForceHarmonics(AbstractForceSpectrum):
         "The force of the shaker is not a pure sine: it contains harmonics 2 and 3."
     )
     shape: ClassVar[Shape] = Shape(Part.HARMONICS)
-    confounders: ClassVar[tuple[Confounder, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
     second: Scalar = parameter(
         "1", "harmonic 2 of the force over its fundamental", start=lambda _: 0.02
     )
@@ -75,8 +57,6 @@ class ForceGainError(AbstractMeasurementEffect):
         "The force is recorded in a wrong scale: the calibration factor of the force sensor, or a "
         "mass between it and the structure."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE, FORCE_OR_SENSOR_GAIN)
-    like_force_gain: ClassVar[bool] = True
     gain: Scalar = parameter("1", "relative error of the force", **_RELATIVE)
 
     def recorded(
@@ -93,7 +73,6 @@ class ForceOffsetError(AbstractMeasurementEffect):
         "The recorded amplitude of the force is too small or too large by a constant, such as a "
         "noise floor or a threshold."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (FRICTION_OR_FORCE_OFFSET,)
     offset: Scalar = parameter(
         "N",
         "true minus recorded amplitude of the force",
@@ -114,8 +93,6 @@ class SensorGainError(AbstractMeasurementEffect):
         "The velocity is recorded in a wrong scale: the calibration factor of the sensor, or peak "
         "values taken for amplitudes."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE, FORCE_OR_SENSOR_GAIN)
-    like_force_gain: ClassVar[bool] = True
     gain: Scalar = parameter("1", "relative error of the velocity", **_RELATIVE)
 
     def recorded(
@@ -135,8 +112,6 @@ class SensorPhaseError(AbstractMeasurementEffect):
         "The recorded velocity leads or lags by a constant phase, such as that of a filter or a "
         "delay between the channels."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
-    only_phase: ClassVar[bool] = True
     phase_deg: Scalar = parameter(
         "°",
         "phase by which the recorded velocity leads",
@@ -161,8 +136,6 @@ class ResidualMode(AbstractMeasurementEffect):
         "Modes far from the measured frequencies, missing in the model, add a displacement "
         "proportional to the force."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
-    follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
     receptance: Scalar = parameter(
         "m/N",
@@ -190,9 +163,6 @@ class CloseMode(AbstractMeasurementEffect):
         "A further linear mode near the measured frequencies, missing in the model, adds its "
         "response."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (FURTHER_MODE,)
-    searched: ClassVar[bool] = False
-    follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
     modal_constant: Scalar = parameter("1/kg", "product of its shapes at sensor and force")
     frequency_hz: Scalar = parameter(
@@ -204,29 +174,6 @@ class CloseMode(AbstractMeasurementEffect):
     damping_ratio: Scalar = parameter(
         "1", "its damping ratio", rules=OF_A_DAMPING_RATIO, prior=ADDED_MODE_DAMPING
     )
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """Modes a few half-power bandwidths away, of a clearly visible amplitude at resonance."""
-        starts: Starts = []
-        ratio = max(scales.damping_ratio, _LIGHT)
-        for away in (-8.0, -3.0, 3.0, 8.0):
-            fraction = 1 + float(np.clip(away * ratio, -_WIDE, _WIDE))
-            distance = abs(fraction**2 - 1 + 2j * ratio * fraction) * scales.frequency**2
-            hz = fraction * scales.frequency / HERTZ
-            starts.append((VISIBLE_CHANGE * scales.receptance * distance, hz, ratio))
-        return starts
-
-    @classmethod
-    def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
-        """Half a half-power bandwidth in frequency."""
-        constant, hz, ratio = start
-        return abs(constant), ratio * hz, 0.5 * ratio
-
-    @classmethod
-    def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
-        hz = 1.1 * natural_frequency / HERTZ
-        return cls(*jax.device_put([np.asarray(value) for value in (0.0, hz, damping_ratio)]))
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -246,7 +193,6 @@ class ModeShapeChange(AbstractMeasurementEffect):
         "The mode shape changes with the amplitude: the ratio of sensor motion to modal "
         "coordinate is not constant."
     )
-    confounders: ClassVar[tuple[Confounder, ...]] = (RESPONSE_SCALE,)
     stage: ClassVar[int] = 0
     coefficient: Scalar = parameter(
         "1/(kg m²)",

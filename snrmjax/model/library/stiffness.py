@@ -3,24 +3,16 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 
-from snrmjax.model.effect_base import AbstractMemoryless, AbstractNonsmooth, Scalar, Starts
+from snrmjax.model.effect_base import AbstractMemoryless, AbstractNonsmooth, Scalar
 from snrmjax.model.effect_metadata import (
     NON_NEGATIVE,
     Argument,
-    Confounder,
-    MotionScales,
     Part,
     Prior,
     Shape,
     Symmetry,
     parameter,
-)
-from snrmjax.model.library.confounders import (
-    ONE_SIDED_OR_TWO_SIDED,
-    SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,
-    STRUCTURE_OR_FORCE_SPECTRUM,
 )
 from snrmjax.model.nonsmooth_points import NonsmoothPoints
 from snrmjax.numerics.rules import NOT_NEGATIVE
@@ -28,11 +20,6 @@ from snrmjax.numerics.rules import NOT_NEGATIVE
 _ODD = Shape(Part.STIFFNESS, Symmetry.ODD, Argument.DISPLACEMENT)
 _EVEN = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT, strength_order=2)
 _OF_A_GAP = Prior(0.0, 1.2, lambda scales: scales.largest)
-_FRACTIONS = (0.3, 0.55, 0.75, 0.9)  # of the largest amplitude: starting values of a gap
-
-
-def _contact_starts(scales: MotionScales, fraction: float) -> Starts:
-    return [(fraction * scales.change, gap * scales.largest) for gap in _FRACTIONS]
 
 
 class CubicStiffness(AbstractMemoryless):
@@ -44,7 +31,6 @@ class CubicStiffness(AbstractMemoryless):
         "midplane stretching of a clamped beam."
     )
     shape: ClassVar[Shape] = _ODD._replace(power=2, factor=0.75)
-    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg m² s²)", "cubic stiffness")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
@@ -64,14 +50,7 @@ class QuadraticStiffness(AbstractMemoryless):
         "load: the motion loses its symmetry and softens."
     )
     shape: ClassVar[Shape] = _EVEN._replace(power=2)
-    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,)
     coefficient: Scalar = parameter("1/(kg^1/2 m s²)", "quadratic stiffness")
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """Softening by a clearly visible change, with either sign."""
-        coefficient = float(np.sqrt(1.2 * scales.change) * scales.frequency / scales.amplitude)
-        return [(coefficient,), (-coefficient,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         return self.coefficient * displacement**2
@@ -105,13 +84,7 @@ class BilinearStiffness(AbstractNonsmooth):
         "that opens and closes."
     )
     shape: ClassVar[Shape] = _EVEN
-    confounders: ClassVar[tuple[Confounder, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
     stiffness: Scalar = parameter("1/s²", "difference of stiffness between the two sides")
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """A twentieth of the linear stiffness, with either sign."""
-        return [(0.05 * scales.frequency**2,), (-0.05 * scales.frequency**2,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         return 0.5 * self.stiffness * jnp.abs(displacement)
@@ -134,16 +107,10 @@ class GapStiffness(AbstractNonsmooth):
         "displacement exceeds the gap."
     )
     shape: ClassVar[Shape] = _ODD
-    confounders: ClassVar[tuple[Confounder, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
     stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NON_NEGATIVE)
     gap: Scalar = parameter(
         "kg^1/2 m", "displacement at contact", rules=(NOT_NEGATIVE,), prior=_OF_A_GAP
     )
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """Gaps at several fractions of the largest amplitude."""
-        return _contact_starts(scales, 3.0)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         above = jnp.maximum(displacement - self.gap, 0.0)
@@ -166,14 +133,8 @@ class OneSidedStop(AbstractNonsmooth):
         "A stop on one side: a further spring that engages where the displacement exceeds the gap."
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.NEITHER, Argument.DISPLACEMENT)
-    confounders: ClassVar[tuple[Confounder, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
     stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NON_NEGATIVE)
     gap: Scalar = parameter("kg^1/2 m", "displacement at contact", prior=_OF_A_GAP)
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """Gaps at several fractions of the largest amplitude."""
-        return _contact_starts(scales, 6.0)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         return self.stiffness * jnp.maximum(displacement - self.gap, 0.0)
@@ -185,8 +146,8 @@ class OneSidedStop(AbstractNonsmooth):
 class StaticPreload(AbstractMemoryless):
     """A constant force; with a nonlinear stiffness it shifts ω₀ and generates a second harmonic.
 
-    At points it acts on the structure like `static_load`: a positive `constant_force` F moves
-    the equilibrium in the positive direction, f = −F. On the mode of interest it is, like all
+    At points, such as a weight, it pushes the structure: a positive `constant_force` F moves the
+    equilibrium in the positive direction, f = −F. On the mode of interest it is, like all
     forces there, a restoring force on the left of the equation of motion, f = F, and moves the
     equilibrium in the negative direction.
     """
@@ -197,16 +158,7 @@ class StaticPreload(AbstractMemoryless):
         "a nonlinear spring is stiffer or softer; at points along the positive direction."
     )
     shape: ClassVar[Shape] = _EVEN
-    confounders: ClassVar[tuple[Confounder, ...]] = (SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,)
-    # No effect on a linear structure; with a cubic spring it acts like a quadratic one.
-    searched: ClassVar[bool] = False
     constant_force: Scalar = parameter("kg^1/2 m/s²", "constant force")
-
-    @classmethod
-    def starts(cls, scales: MotionScales) -> Starts:
-        """A static displacement of a fifth of the amplitude."""
-        force = 0.2 * scales.frequency**2 * scales.amplitude
-        return [(force,), (-force,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         force = self.constant_force if self.at is None else -self.constant_force

@@ -14,10 +14,7 @@ from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.detection import beyond_data
 from snrmjax.diagnose.priors import AS_NOISE
-from snrmjax.diagnose.response_prediction import (
-    LevelResponse,
-    is_response_controlled,
-)
+from snrmjax.diagnose.response_prediction import LevelResponse, is_response_controlled
 from snrmjax.diagnose.verdict import NOISE_REJECTED, NONE, UNKNOWN, Verdict
 from snrmjax.io import diagnosis_results as written
 from snrmjax.io.files import write_summary
@@ -25,7 +22,7 @@ from snrmjax.io.models import write_model
 from snrmjax.io.tables import write_table
 from snrmjax.measure.states import relative_errors
 from snrmjax.model.effect_shape import shape_of
-from snrmjax.model.effects import EFFECTS, effect_class
+from snrmjax.model.effects import effect_class
 from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
 from snrmjax.report.figures.diagnosis import (
     CONTROLLED_CAPTION,
@@ -49,11 +46,7 @@ from snrmjax.report.html import (
     with_error,
     write_report,
 )
-from snrmjax.report.pages.resonance_table import (
-    resonance_in_words,
-    resonance_rows,
-    velocity_unit,
-)
+from snrmjax.report.pages.resonance_table import resonance_in_words, resonance_rows, velocity_unit
 from snrmjax.report.parameters import (
     own_parameters,
     parameter_meaning,
@@ -387,7 +380,7 @@ def _limits_section(diagnosis: Diagnosis) -> Section:
     for name, limit in sorted(diagnosis.detection_limits.items()):
         kind, parameter = name.split(".", 1)
         from_value = (number(limit, 2), printed_unit(kind, parameter))
-        if beyond_data(EFFECTS[kind], limit, scales):
+        if beyond_data(kind, limit, scales):
             from_value = ("not detectable in these data", "")
         rows.append((effect_name(kind), parameter_meaning(kind, parameter), *from_value))
     table = ReportTable(

@@ -38,11 +38,27 @@ _WORDS = _Words()
 def sentence(fact: Fact) -> str:
     """A fact as a sentence.
 
+    Raises `LookupError` for a kind that no file of this folder words, and for a value of the
+    wording that the fact does not have.
+
     >>> sentence(Fact("record_left_out", why="it is clipped"))
     'a record was left out: it is clipped'
     """
-    wording = wordings()[fact.kind]
-    return wording(**fact) if callable(wording) else _WORDS.format(wording, **fact)
+    wording = wordings().get(fact.kind)
+    if wording is None:
+        raise LookupError(
+            f"the fact {fact.kind!r} has no wording: add an entry to `SENTENCES` of its room's "
+            "file in snrmjax/report/sentences."
+        )
+    if callable(wording):
+        return wording(**fact)
+    try:
+        return _WORDS.format(wording, **fact)
+    except KeyError as error:
+        raise LookupError(
+            f"the fact {fact.kind!r} is worded with {error}, but has {sorted(fact)}: see its entry "
+            "in snrmjax/report/sentences."
+        ) from error
 
 
 def sentences(facts: Sequence[Fact]) -> list[str]:

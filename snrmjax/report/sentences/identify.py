@@ -402,6 +402,12 @@ SENTENCES: dict[str, Wording] = {
     "resonance_of_a_level": _resonance_range,
     "errors_of_a_level": _errors_of_a_level,
     # Advice.
+    "advice_complete": "as many states as requested",
+    "fewer_candidates": "fewer candidate states than requested",
+    "no_state_to_measure": (
+        "no stable state of the fitted responses within 70° of resonance can be measured in this "
+        "range of forces, frequencies and measured amplitudes"
+    ),
     "advice_of_unconverged_fit": (
         "the fit behind this advice has not converged: a converged fit may advise other states"
     ),

@@ -19,9 +19,9 @@ from snrmjax.diagnose.naming import hypotheses, parts
 from snrmjax.diagnose.naming.columns import hypothesis_columns
 from snrmjax.diagnose.naming.evidence import remainder_stds
 from snrmjax.diagnose.naming.hypotheses import hypotheses_of
-from snrmjax.diagnose.naming.readings import ModelMotion, readings_of
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.naming.rows import Cell, problem_of, solved
+from snrmjax.diagnose.readings import ModelMotion, readings_of
 from snrmjax.model.effects import EFFECTS
 
 LAWS = ("cubic_stiffness", "quintic_stiffness", "quadratic_damping", "coulomb_friction")

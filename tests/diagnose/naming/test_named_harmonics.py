@@ -7,7 +7,7 @@ import pytest
 from truths.phased_states import OMEGA, SHAPE, dynamic, named, nothing
 
 from snrmjax.diagnose.naming.detection import detection_limits
-from snrmjax.diagnose.naming.readings import RecordedHarmonics
+from snrmjax.diagnose.readings import RecordedHarmonics
 
 ORDERS = (2, 3)
 NOISE = 4e-6  # m/s of each part, where velocities go up to 0.5

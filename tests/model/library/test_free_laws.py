@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import snrmjax as sj
+from snrmjax.diagnose.kinds.registry import idle_effect
 from snrmjax.io.models import read_model, write_model
 from snrmjax.model.effects import LAWS, make_effect
 from snrmjax.model.parameters import parameter_names, parameter_value, with_parameters
@@ -146,7 +147,7 @@ def test_a_model_with_a_law_returns_from_its_file_with_named_values(kind, tmp_pa
     other = with_parameters(model, [last], jnp.array([7.5]))
     assert float(parameter_value(other, last)) == 7.5
     assert float(parameter_value(other, names[0])) == float(parameter_value(model, names[0]))
-    idle = model.effects[0].idle(1.0, 0.02)
+    idle = idle_effect(model.effects[0], 1.0, 0.02)
     t = jnp.linspace(0, 2 * np.pi, 64, endpoint=False)
     np.testing.assert_array_equal(idle.cycle_force(jnp.cos(t), -jnp.sin(t)), 0.0)
 

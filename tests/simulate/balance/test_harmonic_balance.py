@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from truths.kinds import KINDS, of_class, silent
 
 from snrmjax.model.builders.beams import flat_beam
-from snrmjax.model.effect_base import AbstractForce
-from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.effect_base import AbstractForce, AbstractMeasurementEffect
+from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import simulated_structure, structure
@@ -23,31 +24,9 @@ from snrmjax.simulate.balance.harmonic_balance import (
 )
 from snrmjax.simulate.balance.harmonics import velocity_phasors
 
-MODERATE = {
-    "cubic_stiffness": {"coefficient": 1.3},
-    "quadratic_stiffness": {"coefficient": -0.7},
-    "quintic_stiffness": {"coefficient": 2.0},
-    "bilinear_stiffness": {"stiffness": 0.8},
-    "gap_stiffness": {"stiffness": 3.0, "gap": 0.4},
-    "one_sided_stop": {"stiffness": 2.0, "gap": 0.3},
-    "quadratic_damping": {"coefficient": 0.6},
-    "cubic_damping": {"coefficient": 0.5},
-    "van_der_pol_damping": {"coefficient": 0.9},
-    "static_preload": {"constant_force": -1.1},
-    "coulomb_friction": {"force": 0.7},
-    "jenkins_slider": {"stiffness": 1.5, "slip_displacement": 0.4},
-    "iwan_microslip": {"coefficient": 0.9, "exponent": 1.6},
-}
-STRENGTHS = {"coefficient", "stiffness", "constant_force", "force"}
-# Effects that change the balance other than by a force.
-OTHERS = {
-    "added_mass": {"mass": 0.15},
-    "linear_frequency_shift": {"relative_shift": -0.1},
-    "linear_damping_change": {"damping_ratio_change": 0.05},
-    "frequency_drift": {"relative_drift": 0.07},
-    "force_harmonics": {"second": 0.3, "third": -0.2},
-    "internal_resonance_1_3": {"coefficient": 0.4, "frequency_hz": 2.5, "damping_ratio": 0.02},
-}
+FORCES = of_class(AbstractForce)
+# Effects that change the balance other than by a force; of two internal resonances one.
+OTHERS = {*KINDS} - {*FORCES, *of_class(AbstractMeasurementEffect), "internal_resonance_1_2"}
 
 
 residual_of = eqx.filter_jit(HarmonicBalance.residual)
@@ -58,14 +37,12 @@ def one_mode(potential=None, effects=(), omega=2.0, ratio=0.05, participation=1.
     return structure(modes, polynomial_potential(potential or {}, 1), effects=effects)
 
 
-def two_modes_with_effects(forces=tuple(MODERATE), others=()):
+def two_modes_with_effects(forces=FORCES, others=()):
     """With all forces, those not named at strength zero: one structure, compiled once."""
     modes = linear_modes([2.0, 5.0], [0.03, 0.01], [[1.0, 2.0]], [1.5, -0.5], mode_of_interest=1)
-    effects = [
-        make_effect(k, {n: v * (k in forces or n not in STRENGTHS) for n, v in p.items()})
-        for k, p in MODERATE.items()
-    ]
-    effects += [make_effect(k, OTHERS[k]) for k in others]
+    every = {kind: of.parameters for kind, of in KINDS.items()}
+    effects = [make_effect(k, every[k] if k in forces else silent(k, every[k])) for k in FORCES]
+    effects += [make_effect(k, every[k]) for k in others]
     potential = polynomial_potential({"111": 0.5, "1122": 0.7, "222": -0.2}, 2)
     return simulated_structure(
         dataclasses.replace(
@@ -109,11 +86,7 @@ def test_jacobian_of_the_flat_beam_is_exact(options):
     assert_exact_jacobian(harmonic_balance(flat_beam(), 1e-2, 1e-5, **options))
 
 
-def test_every_force_is_among_those_below():
-    assert set(MODERATE) == {k for k, e in EFFECTS.items() if issubclass(e, AbstractForce)}
-
-
-@pytest.mark.parametrize("kind", MODERATE)
+@pytest.mark.parametrize("kind", FORCES)
 def test_jacobian_of_every_force_is_exact(kind):
     settings = {"harmonic_order": 3}
     balance = harmonic_balance(two_modes_with_effects((kind,)), 1e-2, 1.0, **settings)
@@ -126,7 +99,7 @@ def test_jacobian_of_every_force_is_exact(kind):
 @pytest.mark.long
 @pytest.mark.parametrize("cosine_only", [False, True])
 def test_jacobian_of_all_effects_together_is_exact(cosine_only):
-    model = two_modes_with_effects(others=tuple(OTHERS))
+    model = two_modes_with_effects(others=sorted(OTHERS))
     assert model.n_modes == 3  # with the mode of the internal resonance
     balance = harmonic_balance(model, 1e-2, 1.0, harmonic_order=3, cosine_only=cosine_only)
     assert_exact_jacobian(balance)

@@ -6,15 +6,17 @@ next in closed form, sliders marched in small steps with their exact return map.
 """
 
 import dataclasses
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from truths.kinds import KINDS, MEMORYLESS, in_units, of_class, silent
 
-from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.effect_base import AbstractAddedMode, AbstractHysteresis, AbstractNonsmooth
+from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.structures import simulated_structure, structure
 from snrmjax.simulate.continuation.stability import Stability, floquet_multipliers, stability_of
@@ -175,56 +177,23 @@ def marched(stiffness, slip, omega, *, cycles=CYCLES, steps=512):
 
 # -------------------------------------------------------------------------------- the effects
 
-# The linear force at the linear resonance is ω²·SIZE; parameters are relative to it.
-CUBIC = SQUARED / SIZE**2
-DAMPING = VISCOUS / (OMEGA * SIZE)
-GAP = 0.3 * SIZE
+GROUPS = {
+    "nonsmooth": of_class(AbstractNonsmooth),
+    "friction": of_class(AbstractHysteresis),
+    "coupled": of_class(AbstractAddedMode),
+}
+GROUPS["smooth"] = [
+    kind
+    for kind, of in KINDS.items()
+    if of.weak is not None and not any(kind in kinds for kinds in GROUPS.values())
+]
 
-SMOOTH = {
-    "cubic_stiffness": {"coefficient": 0.05 * CUBIC},
-    "quadratic_stiffness": {"coefficient": 0.25 * SQUARED / SIZE},
-    "quintic_stiffness": {"coefficient": 0.05 * CUBIC / SIZE**2},
-    "quadratic_damping": {"coefficient": 0.5 * DAMPING},
-    "cubic_damping": {"coefficient": 0.5 * DAMPING / (OMEGA * SIZE)},
-    "van_der_pol_damping": {"coefficient": 2.0 * VISCOUS / SIZE**2},
-    "static_preload": {"constant_force": 0.3 * SQUARED * SIZE},
-    "linear_frequency_shift": {"relative_shift": 0.02},
-    "linear_damping_change": {"damping_ratio_change": 0.01},
-    "frequency_drift": {"relative_drift": 0.03},
-    "added_mass": {"mass": 0.05},
-    "force_harmonics": {"second": 0.8, "third": 0.5},
-}
-NONSMOOTH = {
-    "bilinear_stiffness": {"stiffness": 0.3 * SQUARED},
-    "gap_stiffness": {"stiffness": 0.15 * SQUARED, "gap": GAP},
-    "one_sided_stop": {"stiffness": 0.2 * SQUARED, "gap": GAP},
-}
-FRICTION = {
-    "coulomb_friction": {"force": 0.2 * PARTICIPATION},
-    "jenkins_slider": {"stiffness": 0.2 * SQUARED, "slip_displacement": 0.1 * SIZE},
-    "iwan_microslip": {"coefficient": 0.1 * SQUARED / SIZE**0.5, "exponent": 1.5},
-}
-COUPLED = {
-    "internal_resonance_1_3": {
-        "coefficient": 0.5 * CUBIC,
-        "frequency_hz": 3.02 * OMEGA / (2 * np.pi),
-        "damping_ratio": 0.01,
-    },
-    "internal_resonance_1_2": {
-        "coefficient": 0.2 * SQUARED / SIZE,
-        "frequency_hz": 2.02 * OMEGA / (2 * np.pi),
-        "damping_ratio": 0.02,
-    },
-}
-GROUPS = {"smooth": SMOOTH, "nonsmooth": NONSMOOTH, "friction": FRICTION, "coupled": COUPLED}
-# Effects visible at the fundamental only together with another one.
-BESIDE = {
-    "static_preload": {"cubic_stiffness": {"coefficient": 0.05 * CUBIC}},
-    "force_harmonics": {
-        "cubic_stiffness": {"coefficient": 0.05 * CUBIC},
-        "quadratic_stiffness": {"coefficient": 0.25 * SQUARED / SIZE},
-    },
-}
+
+def weak(kind):
+    """The parameters that change the resonance clearly, but not greatly."""
+    return in_units(kind, KINDS[kind].weak, SIZE, 1 / OMEGA)
+
+
 ORDER = 0.6  # test order, for drift
 HARMONICS = {"smooth": 11, "nonsmooth": 15, "friction": 15, "coupled": 11}
 # Difference of the two, relative to the fundamental. Smooth laws: SciPy's 1e-7 per step,
@@ -235,21 +204,11 @@ TOLERANCE = {"smooth": 1e-5, "nonsmooth": 1e-4, "friction": 1e-4, "coupled": 1e-
 COULOMB = 5e-4
 
 
-def law_of(kind, p):
+def law_of(kind):
     """Force of a memoryless effect, from its definition."""
-    laws = {
-        "cubic_stiffness": lambda q, v: p["coefficient"] * q**3,
-        "quadratic_stiffness": lambda q, v: p["coefficient"] * q**2,
-        "quintic_stiffness": lambda q, v: p["coefficient"] * q**5,
-        "bilinear_stiffness": lambda q, v: 0.5 * p["stiffness"] * np.abs(q),
-        "gap_stiffness": lambda q, v: p["stiffness"] * (q - np.clip(q, -p["gap"], p["gap"])),
-        "one_sided_stop": lambda q, v: p["stiffness"] * np.maximum(q - p["gap"], 0.0),
-        "quadratic_damping": lambda q, v: p["coefficient"] * np.abs(v) * v,
-        "cubic_damping": lambda q, v: p["coefficient"] * v**3,
-        "van_der_pol_damping": lambda q, v: p["coefficient"] * q**2 * v,
-        "static_preload": lambda q, v: p["constant_force"] + 0.0 * q,
-    }
-    return laws.get(kind, lambda q, v: 0.0 * q)
+    if kind in MEMORYLESS:
+        return partial(MEMORYLESS[kind].force, p=weak(kind))
+    return lambda q, v: 0.0 * q
 
 
 def linear_terms_of(kind, p):
@@ -269,7 +228,7 @@ def coupling_of(kind, p):
 @lru_cache
 def truth(kind):
     """Phasors (frequency, harmonic) of the mode of interest in the settled motion."""
-    parameters = next(kinds[kind] for kinds in GROUPS.values() if kind in kinds)
+    parameters = weak(kind)
     if kind == "coulomb_friction":
         rows = [coulomb_oscillator(parameters["force"], omega) for omega in FREQUENCIES]
         return phasors(np.stack(rows, axis=1))
@@ -283,12 +242,11 @@ def truth(kind):
         edges = SIZE * np.linspace(0.0, 1.0, 201) ** 2
         cells = c * p * np.diff(edges ** (p - 1))
         return phasors(marched(cells, 0.5 * (edges[1:] + edges[:-1]), FREQUENCIES, cycles=40))
-    if kind in COUPLED:
+    if kind in GROUPS["coupled"]:
         added = coupling_of(kind, parameters)
         found = settled(lambda q, v: 0.0 * q, FREQUENCIES, added=added)
         return phasors(found[:, :, 0])
-    laws = [law_of(kind, parameters)]
-    laws += [law_of(other, values) for other, values in BESIDE.get(kind, {}).items()]
+    laws = [law_of(one) for one in (kind, *KINDS[kind].only_with)]
     orders = (0.0, 1.0, parameters.get("second", 0.0), parameters.get("third", 0.0))
     found = settled(
         lambda q, v: sum(law(q, v) for law in laws),
@@ -296,21 +254,17 @@ def truth(kind):
         orders=orders,
         linear=linear_terms_of(kind, parameters),
         # A corner within a step costs many steps: a coarser tolerance suffices here.
-        **({"cycles": 104, "rtol": 1e-6} if kind in NONSMOOTH else {}),
+        **({"cycles": 104, "rtol": 1e-6} if kind in GROUPS["nonsmooth"] else {}),
     )
     return phasors(found[:, :, 0])
 
 
 def model_with(group, kind, *, without=False):
     """All effects of a group, so that one program serves them, all but one of them at zero."""
-    silent = ("coefficient", "stiffness", "force", "constant_force", "second", "third", "mass")
-    silent += ("relative_shift", "relative_drift", "damping_ratio_change")
+    acting = {*KINDS[kind].only_with, *([] if without else [kind])}
     effects = []
-    for name, parameters in GROUPS[group].items():
-        values = {key: 0.0 if key in silent else value for key, value in parameters.items()}
-        if name == kind and not without:
-            values = parameters
-        values = BESIDE.get(kind, {}).get(name, values)
+    for name in GROUPS[group]:
+        values = weak(name) if name in acting else silent(name, weak(name))
         effects.append(make_effect(name, values))
     modes = linear_modes([OMEGA], [RATIO], [[1.0]], [PARTICIPATION])
     made = structure(modes, effects=tuple(effects))
@@ -363,9 +317,3 @@ def test_harmonic_balance_is_the_settled_motion(group, kind):
     # A settled motion is stable.
     multipliers = floquet_multipliers(simulated_structure(model), coefficients, FREQUENCIES)
     assert np.all(stability_of(multipliers) == Stability.STABLE)
-
-
-def test_no_effect_with_a_force_is_left_out():
-    silent = {"force_gain_error", "force_offset_error", "sensor_gain_error", "sensor_phase_error"}
-    silent |= {"residual_mode", "mode_shape_change", "close_mode"}
-    assert {kind for kinds in GROUPS.values() for kind in kinds} == set(EFFECTS) - silent

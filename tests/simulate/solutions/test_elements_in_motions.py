@@ -118,7 +118,7 @@ def test_friction_and_springs_between_points_move_as_integrated_in_time():
 def test_a_damped_mode_goes_from_stuck_to_free():
     """NLvib's example 5: the linear frequencies of both structures are its ends."""
     mass, stiffness = np.diag([0.02, 1.0]), np.array([[40.0, -40.0], [-40.0, 640.0]])
-    friction = element("regularised_friction", "x1", force_limit=5.0, velocity=0.05)
+    friction = element("regularised_friction", "x1", slip_force=5.0, velocity=0.05)
     model = sj.model.from_matrices(mass, None, stiffness, force="x1", effects=friction)
     mode = sj.simulate.damped_normal_mode(model, 24.156 * 10 * 1.3846, harmonic_order=9)
     free = np.sqrt(scipy.linalg.eigh(stiffness, mass, eigvals_only=True)[0])

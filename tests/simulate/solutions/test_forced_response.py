@@ -1,5 +1,7 @@
 """Forced responses against linear formulas, closed orbits in time, and the paper's numbers."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from threadpoolctl import threadpool_info, threadpool_limits
+from truths.kinds import MEMORYLESS, silent
 
-from snrmjax.model.effect_base import AbstractMemoryless
-from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
@@ -260,42 +262,16 @@ def test_phase_resonances_are_in_phase(flat_curve, curved_curves):
 
 # ------------------------------------------------------------------------------------- effects
 
-# kind: parameters and the same force by hand. At ω = 2 and displacements of order one every
-# effect changes the answer by 3 % and more.
-SETTLED = {
-    "cubic_stiffness": ({"coefficient": 0.8}, lambda q, v: 0.8 * q**3),
-    "quadratic_stiffness": ({"coefficient": 0.6}, lambda q, v: 0.6 * q**2),
-    "quintic_stiffness": ({"coefficient": 0.8}, lambda q, v: 0.8 * q**5),
-    "bilinear_stiffness": ({"stiffness": 1.2}, lambda q, v: 0.6 * np.abs(q)),
-    "gap_stiffness": (
-        {"stiffness": 1.5, "gap": 0.3},
-        lambda q, v: 1.5 * (q - np.clip(q, -0.3, 0.3)),
-    ),
-    "one_sided_stop": (
-        {"stiffness": 1.5, "gap": 0.2},
-        lambda q, v: 1.5 * np.maximum(q - 0.2, 0.0),
-    ),
-    "quadratic_damping": ({"coefficient": 0.3}, lambda q, v: 0.3 * v * np.abs(v)),
-    "cubic_damping": ({"coefficient": 0.2}, lambda q, v: 0.2 * v**3),
-    "van_der_pol_damping": ({"coefficient": 0.8}, lambda q, v: 0.8 * q**2 * v),
-    "static_preload": ({"constant_force": 0.9}, lambda q, v: 0.9 + 0.0 * q),
-}
 
-
-def test_all_memoryless_effects_are_settled_below():
-    memoryless = {k for k, effect in EFFECTS.items() if issubclass(effect, AbstractMemoryless)}
-    assert set(SETTLED) == memoryless
-
-
-@pytest.mark.parametrize("kind", SETTLED)
+@pytest.mark.parametrize("kind", MEMORYLESS)
 def test_effects_agree_with_settled_motions(kind, time_domain, state_of):
-    parameters, by_hand = SETTLED[kind]
     # A preload acts only together with a nonlinear stiffness; the others act alone.
-    # With all ten, nine of them at strength zero: one structure, compiled once.
+    # With all, but one at strength zero: one structure, compiled once.
     effects = [
-        make_effect(name, parameters if name == kind else dict.fromkeys(others, 0.0))
-        for name, (others, _) in SETTLED.items()
+        make_effect(name, of.parameters if name == kind else silent(name, of.parameters))
+        for name, of in MEMORYLESS.items()
     ]
+    by_hand = partial(MEMORYLESS[kind].force, p=MEMORYLESS[kind].parameters)
     potential = {"1111": 0.1 if kind == "static_preload" else 0.0}
     model = one_mode(potential, tuple(effects))
     omega, force = 2.1, 0.35

@@ -74,7 +74,7 @@ def surface(normal_force):
     """A mass on a surface, along and across it; a static load presses it, a force lifts it."""
     values = {"stiffness": 5.0, "normal_stiffness": 21.0, "friction": 0.85, "preload": 0.0}
     contact = sj.model.make_effect("friction_contact", values, at="x", normal_at="y")
-    load = sj.model.make_effect("static_load", {"load": 100.0}, at="y")
+    load = sj.model.make_effect("static_preload", {"constant_force": 100.0}, at="y")
     return sj.model.from_matrices(
         *(np.eye(2), np.diag([0.35, 2.0]), np.diag([12.0, 21.0]), ("x", "y")),
         force={"x": 1.0, "y": normal_force},

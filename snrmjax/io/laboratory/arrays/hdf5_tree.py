@@ -22,7 +22,6 @@ from snrmjax.io.laboratory.names import role_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
 
-_NETCDF = (".nc", ".nc4", ".cdf")  # extensions of netCDF files
 _MOST_OBJECTS = 20_000
 _DEEPEST = 24
 _LONGEST_TEXT = 2**17  # characters, or strings of a list
@@ -99,8 +98,7 @@ def _check_heaps(content: mmap.mmap) -> None:
 
 def read_hdf5(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
     """An HDF5 or netCDF 4 file. Raises `ValueError` as `read_laboratory_file` does."""
-    netcdf = path.suffix.lower() in _NETCDF
-    return file_of_tree(path.name, "netcdf" if netcdf else "hdf5", *open_tree(path), axis)
+    return file_of_tree(path.name, *open_tree(path), axis)
 
 
 def _group(traversal: _Traversal, group: Any) -> dict[str, Node]:

@@ -30,7 +30,7 @@ def read_matlab(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
     with open(path, "rb") as file:
         is_old = is_old_matlab(file.read(8), path.suffix)
     tree, notes = _tree_of_old(path) if is_old else open_tree(path)
-    return file_of_tree(path.name, "matlab", tree, notes, axis)
+    return file_of_tree(path.name, tree, notes, axis)
 
 
 def _tree_of_old(path: Path) -> tuple[dict[str, Node], list[Fact]]:

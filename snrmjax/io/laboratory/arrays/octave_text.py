@@ -43,7 +43,7 @@ def read_octave(path: Path, axis: EvenAxis | None = None) -> LaboratoryFile:
         node = _value(lines, name, 0)
         if node is not None:
             tree[name] = node
-    return file_of_tree(path.name, "octave", tree, lines.notes, axis)
+    return file_of_tree(path.name, tree, lines.notes, axis)
 
 
 class _Lines:

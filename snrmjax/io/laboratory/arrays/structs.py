@@ -16,7 +16,7 @@ from snrmjax.io.laboratory.arrays.even_axis import (
 )
 from snrmjax.io.laboratory.arrays.records import recording_of
 from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, in_memory
-from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, NumberTable
+from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning, is_per_force
 from snrmjax.io.laboratory.shared_clock import joined_structs
@@ -56,7 +56,6 @@ class Struct(NamedTuple):
 
 def file_of_tree(
     name: str,
-    kind: Kind,
     tree: Mapping[str, Node],
     notes: Sequence[Fact],
     axis: EvenAxis | None = None,
@@ -74,7 +73,6 @@ def file_of_tree(
     records = joined_structs(contents.recordings)
     return LaboratoryFile(
         name,
-        kind,
         tuple(records),
         tuple(contents.responses),
         contents.numbered(),

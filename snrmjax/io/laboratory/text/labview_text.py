@@ -100,7 +100,7 @@ def read_labview_text(path: Path) -> LaboratoryFile:
     mark = next(word for word, each in SEPARATORS.items() if each == style.separator)
     notes.append(Fact("text_says", separator=mark, decimal=style.decimal, n=len(segments)))
     return LaboratoryFile(
-        path.name, "lvm", tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
+        path.name, tuple(recordings), (), tuple(tables), tuple(dict.fromkeys(notes))
     )
 
 

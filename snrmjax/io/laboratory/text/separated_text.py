@@ -75,7 +75,7 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     contents = read_struct("", tree, entry=len(rows) == 1)
     tables = tuple(table._replace(name=path.stem or "table") for table in contents.numbered())
     records = tuple(contents.recordings)
-    return LaboratoryFile(file, "csv", records, (), tables, (*notes, *contents.notes))
+    return LaboratoryFile(file, records, (), tables, (*notes, *contents.notes))
 
 
 class _TableMetadata(NamedTuple):

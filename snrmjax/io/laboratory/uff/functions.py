@@ -82,7 +82,6 @@ def read_uff(path: Path) -> LaboratoryFile:
     source.notes.extend(Fact("model_named", name=name) for name in models if name)
     return LaboratoryFile(
         path.name,
-        "uff",
         tuple(recordings),
         tuple(responses),
         tuple(tables),

@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq, fsolve
 
-from snrmjax.diagnose.naming import describing
-from snrmjax.diagnose.naming.laws import LAWS
+from snrmjax.diagnose.kinds import describing
+from snrmjax.diagnose.kinds.table import HYPOTHESES
 
 X = np.array([0.2, 0.45, 0.8, 1.0])
 OMEGA = np.array([0.97, 1.0, 1.02, 1.05])  # over the natural frequency
@@ -142,7 +142,7 @@ def iwan(exponent, n=400):
     ],
 )
 def test_ratios_of_harmonics_are_those_of_the_force(kind, shape, force, within):
-    law = LAWS[kind]
+    law = HYPOTHESES[kind]
     first, *others = harmonics(force)
     own = law.change(READINGS, *shape)
     seen = np.abs(own) > 1e-9
@@ -183,7 +183,7 @@ def of_even_spring(force, x, omega):
     ],
 )
 def test_an_even_spring_has_the_second_harmonic_of_its_own_motion(kind, strength, force, side):
-    law, shape = LAWS[kind], (np.log(strength), side)
+    law, shape = HYPOTHESES[kind], (np.log(strength), side)
     wanted = np.array(
         [
             of_even_spring(lambda q: force(side * strength, q), x, omega)

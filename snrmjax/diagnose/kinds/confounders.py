@@ -1,6 +1,6 @@
-"""Effects of the library that measured states may not distinguish, and what separates them."""
+"""Effects that measured states may not distinguish, and what separates them."""
 
-from snrmjax.model.effect_metadata import Confounder
+from snrmjax.diagnose.kinds.hypothesis import Confounder
 
 SEPARATED_BY_MEAN_OR_SECOND_HARMONIC = Confounder(
     "record harmonic 2 or the mean displacement at the largest level"

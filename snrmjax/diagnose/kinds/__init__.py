@@ -1,0 +1,1 @@
+"""What a diagnosis knows of every kind of effect: one row of `table.HYPOTHESES` each."""
