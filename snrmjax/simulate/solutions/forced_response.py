@@ -17,8 +17,8 @@ from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
-from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
-from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import response_balances
 from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.continuation.response_curve import (
@@ -27,11 +27,16 @@ from snrmjax.simulate.continuation.response_curve import (
     assembled,
     without_stable_response,
 )
+from snrmjax.simulate.solutions.branch_switching import curves_from_branch_points
 from snrmjax.simulate.solutions.from_rest import curves_from_rest, curves_where_sweeps_land
 
 DEFAULT_STEPS = StepControl()
+_MOST_CURVES = 16  # of one member; branches of branches end there
 _AT_FOLD = 1e-3  # relative distance in frequency of a fold and the last stable point
-_WHOLE = (CurveStatus.UPPER_END, CurveStatus.LOWER_END, CurveStatus.CLOSED)
+_WHOLE = (
+    *(CurveStatus.UPPER_END, CurveStatus.LOWER_END),
+    *(CurveStatus.CLOSED, CurveStatus.BRANCH_POINT),
+)
 
 
 class ResponseSettings(eqx.Module):
@@ -263,17 +268,40 @@ def _chunk_of_curves(
     for k, branch, response in zip(owner, branches, responses, strict=True):
         results[good[k]].append(dataclasses.replace(response, branch=branch))
     for i, (k, one) in enumerate(zip(good, from_rest, strict=True)):
-        folds = _left_folds(results[k], ends)
-        if folds:
-            new = curves_where_sweeps_land(balances, i, one.curves, folds, ends, settings.steps)
-            own = taken(balances, np.full(len(new), i))
-            landed = assembled(own, new, settings.steps, branch=Branch.LANDING) if new else []
-            results[k] += [curve for curve in landed if np.any(curve.is_stable)]
+        _add_where_sweeps_go(results[k], list(one.curves), balances, i, ends, settings.steps)
         if one.has_no_start:
             first = results[k][0]
             missed = (*first.not_located, "branch")
             results[k][0] = dataclasses.replace(first, not_located=missed)
     return [tuple(curves) for curves in results]
+
+
+def _add_where_sweeps_go(
+    curves: list[ResponseCurve],
+    traced: list[TracedCurve],
+    balances: HarmonicBalance,
+    member: int,
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+) -> None:
+    """Add curves on which a sweep goes on beyond branch points and folds of a member's curves."""
+
+    def added(new: list[TracedCurve], branch: Branch) -> None:
+        own = taken(balances, np.full(len(new), member))
+        found = assembled(own, new, steps, branch=branch) if new else []
+        curves.extend(curve for curve in found if np.any(curve.is_stable))
+        traced.extend(new)
+
+    for curve in curves:  # and those that are added on the way
+        if len(curves) < _MOST_CURVES:
+            added(
+                curves_from_branch_points(balances, member, curve, traced, ends, steps),
+                Branch.BRANCH_POINT,
+            )
+    folds = _left_folds(curves, ends)
+    if folds:
+        landed = curves_where_sweeps_land(balances, member, traced, folds, ends, steps)
+        added(landed, Branch.LANDING)
 
 
 def _left_folds(

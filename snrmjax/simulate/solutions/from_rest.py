@@ -26,7 +26,6 @@ from snrmjax.simulate.continuation.curve_tracing import (
 )
 from snrmjax.simulate.continuation.response_curve import Branch
 
-_N_STARTS = 24  # of the search for further equilibria; few, as every response pays for it
 _MARGIN = 0.5  # factor on the criterion that excludes further equilibria in a direction
 _NEAR_LINEAR = 0.5  # relative difference from the linear response of a motion from rest
 # Resonances outside the range are included where their hysteresis may extend into it: a softening
@@ -184,7 +183,7 @@ def _add_other_equilibria(
     """Add new curves from further stable equilibria, from both ends."""
     owners, rests = [], []
     for k in np.flatnonzero(_may_have_other_equilibria(models)).tolist():
-        for other in equilibria(models[k], n_starts=_N_STARTS):
+        for other in equilibria(models[k]):
             if other.stable and np.any(other.displacement):
                 owners.append(k)
                 rests.append(other.displacement)
