@@ -21,8 +21,9 @@ from snrmjax.simulate.continuation.continuation import (
 )
 from snrmjax.simulate.continuation.curve_tracing import lies_on, trace_both_ways
 from snrmjax.simulate.continuation.newton import Trial, correct
-from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, assembled
 
+_MOST_CURVES = 16  # of one member; branches of branches end there
 _OFF = (0.1, 0.03)  # distances from a branch point at which the other curve is sought, relative
 _CLOSE = 0.02  # of that distance: where the branches are cut, the frequency differs by its square
 _KNOWN = 0.3  # of that distance: nearer to a known curve a motion is on it
@@ -47,11 +48,34 @@ class Crossing(NamedTuple):
         return passes and lies_on(self.point, pair, _KNOWN * self.distance)
 
 
-def curves_from_branch_points(
+def add_branches(
+    curves: list[ResponseCurve],
+    known: list[Float[np.ndarray, "point unknown"]],
+    balances: HarmonicBalance,
+    member: int,
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+) -> None:
+    """Add to one member's curves the branches with stable points that leave them, and theirs.
+
+    Arguments: `known` are the scaled points of curves that are not sought again; those of the new
+    branches are added. No more are sought when there are 16 curves.
+    """
+    for curve in curves:  # and those that are added on the way
+        new = _from_branch_points(balances, member, curve, known, ends, steps)
+        if not new or len(curves) >= _MOST_CURVES:
+            continue
+        own = taken(balances, np.full(len(new), member))
+        found = assembled(own, new, steps, branch=Branch.BRANCH_POINT)
+        curves.extend(branch for branch in found if np.any(branch.is_stable))
+        known.extend(branch.points for branch in new)
+
+
+def _from_branch_points(
     balances: HarmonicBalance,
     member: int,
     curve: ResponseCurve,
-    known: Sequence[TracedCurve],
+    known: Sequence[Float[np.ndarray, "point unknown"]],
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
 ) -> list[TracedCurve]:
@@ -76,7 +100,8 @@ def curves_from_branch_points(
             continue
         for start in crossing.off:
             near = _KNOWN * crossing.distance
-            is_known = any(lies_on(start, one.points, near) for one in (*known, *curves))
+            every = (*known, *(one.points for one in curves))
+            is_known = any(lies_on(start, points, near) for points in every)
             if is_known or not lower <= start[-1] <= upper:
                 continue
             curves += _cut(trace_both_ways(own, start, ends, steps), cuts)

@@ -27,11 +27,10 @@ from snrmjax.simulate.continuation.response_curve import (
     assembled,
     without_stable_response,
 )
-from snrmjax.simulate.solutions.branch_switching import curves_from_branch_points
+from snrmjax.simulate.solutions.branch_switching import add_branches
 from snrmjax.simulate.solutions.from_rest import curves_from_rest, curves_where_sweeps_land
 
 DEFAULT_STEPS = StepControl()
-_MOST_CURVES = 16  # of one member; branches of branches end there
 _AT_FOLD = 1e-3  # relative distance in frequency of a fold and the last stable point
 _WHOLE = (
     *(CurveStatus.UPPER_END, CurveStatus.LOWER_END),
@@ -268,7 +267,7 @@ def _chunk_of_curves(
     for k, branch, response in zip(owner, branches, responses, strict=True):
         results[good[k]].append(dataclasses.replace(response, branch=branch))
     for i, (k, one) in enumerate(zip(good, from_rest, strict=True)):
-        _add_where_sweeps_go(results[k], list(one.curves), balances, i, ends, settings.steps)
+        _add_where_sweeps_go(results[k], one.curves, balances, i, ends, settings.steps)
         if one.has_no_start:
             first = results[k][0]
             missed = (*first.not_located, "branch")
@@ -278,7 +277,7 @@ def _chunk_of_curves(
 
 def _add_where_sweeps_go(
     curves: list[ResponseCurve],
-    traced: list[TracedCurve],
+    traced: Sequence[TracedCurve],
     balances: HarmonicBalance,
     member: int,
     ends: Float[np.ndarray, " end"],
@@ -286,22 +285,14 @@ def _add_where_sweeps_go(
 ) -> None:
     """Add curves on which a sweep goes on beyond branch points and folds of a member's curves."""
 
-    def added(new: list[TracedCurve], branch: Branch) -> None:
-        own = taken(balances, np.full(len(new), member))
-        found = assembled(own, new, steps, branch=branch) if new else []
-        curves.extend(curve for curve in found if np.any(curve.is_stable))
-        traced.extend(new)
-
-    for curve in curves:  # and those that are added on the way
-        if len(curves) < _MOST_CURVES:
-            added(
-                curves_from_branch_points(balances, member, curve, traced, ends, steps),
-                Branch.BRANCH_POINT,
-            )
+    known = [one.points for one in traced]
+    add_branches(curves, known, balances, member, ends, steps)
     folds = _left_folds(curves, ends)
-    if folds:
-        landed = curves_where_sweeps_land(balances, member, traced, folds, ends, steps)
-        added(landed, Branch.LANDING)
+    new = curves_where_sweeps_land(balances, member, known, folds, ends, steps) if folds else []
+    if new:
+        own = taken(balances, np.full(len(new), member))
+        landed = assembled(own, new, steps, branch=Branch.LANDING)
+        curves.extend(curve for curve in landed if np.any(curve.is_stable))
 
 
 def _left_folds(
