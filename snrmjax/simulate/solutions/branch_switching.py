@@ -4,6 +4,7 @@ Where a symmetric motion loses its symmetry, or a mode that the force does not d
 the known curve goes on unstable, and the stable motions are on the other curve through that point.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -67,8 +68,18 @@ def add_branches(
             continue
         own = taken(balances, np.full(len(new), member))
         found = assembled(own, new, steps, branch=Branch.BRANCH_POINT)
-        curves.extend(branch for branch in found if np.any(branch.is_stable))
+        curves.extend(_named(branch, ends) for branch in found if np.any(branch.is_stable))
         known.extend(branch.points for branch in new)
+
+
+def _named(branch: ResponseCurve, ends: Float[np.ndarray, " end"]) -> ResponseCurve:
+    """A branch with its branch points named, where it begins or ends at one."""
+    events = list(branch.event)
+    if not np.isclose(branch.frequency[0], ends).any():
+        events[0] = CurveEvent.BRANCH_POINT
+    if branch.status == CurveStatus.BRANCH_POINT:
+        events[-1] = CurveEvent.BRANCH_POINT
+    return dataclasses.replace(branch, event=tuple(events))
 
 
 def _from_branch_points(
@@ -90,6 +101,8 @@ def _from_branch_points(
     """
     last = len(curve.frequency) - 1
     at = [k for k in curve.at_events(CurveEvent.BRANCH_POINT).tolist() if 0 < k < last]
+    if not at:
+        return []
     own, balance = taken(balances, np.array([member])), as_arrays(taken(balances, member))
     crossings = {k: _crossing(balance, curve, k) for k in at}
     cuts = [one for one in crossings.values() if one is not None]
@@ -110,9 +123,7 @@ def _from_branch_points(
 
 def _crossing(balance: HarmonicBalance, curve: ResponseCurve, k: int) -> Crossing | None:
     """The branch point `k` of a curve, or None where no motion off the curve was found."""
-    here, before, behind = (
-        np.asarray(balance.point(*curve.point(i))) for i in (k, k - 1, k + 1)
-    )
+    here, before, behind = (np.asarray(balance.point(*curve.point(i))) for i in (k, k - 1, k + 1))
     null = np.linalg.svd(np.asarray(_slope(balance, here)))[2][-2:]
     along = null @ (behind - before)
     away = np.array([-along[1], along[0]]) @ null / np.linalg.norm(along)

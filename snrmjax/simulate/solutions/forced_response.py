@@ -84,8 +84,10 @@ def forced_response(
     but has no start there. If the curve from the lower end does not reach the upper one, it is
     traced from the upper end instead, and if that does not reach the lower end either, both parts
     are returned, a part without a start being empty. If a resonance extends beyond
-    `to_frequency`, the branch that enters there from the linear response is returned too. For
-    isolated branches and further potential wells see `isolated_responses`.
+    `to_frequency`, the branch that enters there from the linear response is returned too, and so
+    are those from further stable equilibria, from branch points at which a curve loses its
+    stability, and where a sweep lands beyond a fold. For isolated branches see
+    `isolated_responses`.
     Raises `ValueError` for a force that is not positive and for an empty or infinite frequency
     range.
     Not differentiable: call it outside, and differentiate single motions of its curve:
