@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -123,7 +124,9 @@ def _from_branch_points(
 
 def _crossing(balance: HarmonicBalance, curve: ResponseCurve, k: int) -> Crossing | None:
     """The branch point `k` of a curve, or None where no motion off the curve was found."""
-    here, before, behind = (np.asarray(balance.point(*curve.point(i))) for i in (k, k - 1, k + 1))
+    here, before, behind = (
+        np.asarray(balance.point(*map(jnp.asarray, curve.point(i)))) for i in (k, k - 1, k + 1)
+    )
     null = np.linalg.svd(np.asarray(_slope(balance, here)))[2][-2:]
     along = null @ (behind - before)
     away = np.array([-along[1], along[0]]) @ null / np.linalg.norm(along)
