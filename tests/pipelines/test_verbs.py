@@ -111,7 +111,8 @@ def test_equilibria_that_are_further_are_counted_without_the_one_that_curves_sta
     # 4 q − 3·2 q² + 2 q³ = 2 q (q − 1)(q − 2).
     (note,) = noted({"111": -2.0, "1111": 0.5})
     assert "2 further equilibria, at tip: unstable at 1e+03 mm and stable at 2e+03 mm" in note
-    assert note.endswith("Curves start from rest.")
+    assert "Curves start from rest, and responses also from the stable ones" in note
     # 4 q + 1.25 q² = 1.25 q (q + 3.2).
     (note,) = noted({"111": 1.25 / 3})
     assert "one further equilibrium, at tip: unstable at -3.2e+03 mm." in note
+    assert note.endswith("Curves start from rest.")

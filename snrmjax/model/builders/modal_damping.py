@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
+from jaxtyping import Float
 
 _OVERDAMPED = 0.99  # largest damping ratio; the rest counts as coupling
 _NO_COUPLING = 1e-12  # of the damping of both modes
@@ -101,8 +102,24 @@ def _candidates(
         same, scale = best
         rows = np.stack([m[same], k[same]], axis=1) / scale[same, None]
         norm = np.linalg.norm(rows, axis=0)
-        a, b = np.linalg.lstsq(rows / norm, c[same] / scale[same], rcond=1e-15)[0] / norm
-        yield float(a), float(b)
+        pair = np.zeros(2)
+        for _ in range(2):  # again for what rounding of the first solution leaves
+            left = _remaining(c[same], m[same], k[same], *pair) / scale[same]
+            pair = pair + np.linalg.lstsq(rows / norm, left, rcond=1e-15)[0] / norm
+        yield float(pair[0]), float(pair[1])
+
+
+def _remaining(
+    c: Float[np.ndarray, " entry"],
+    m: Float[np.ndarray, " entry"],
+    k: Float[np.ndarray, " entry"],
+    a: float,
+    b: float,
+) -> Float[np.ndarray, " entry"]:
+    """c − a m − b k without rounding: on a fine mesh a m is of the size of the last digits of c."""
+    unit = [2.0 ** np.round(np.log2(abs(one))) if one else 1.0 for one in (a, b)]
+    entries = np.stack([c, unit[0] * m, unit[1] * k], axis=1)
+    return _exact_product(entries, np.array([[1.0], [-a / unit[0]], [-b / unit[1]]]))[:, 0]
 
 
 def _modal(matrix: Any, shapes: np.ndarray) -> np.ndarray:

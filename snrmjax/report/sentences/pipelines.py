@@ -22,7 +22,7 @@ def _not_located(force: float, unit: str, kinds: Sequence[str]) -> str:
 
 
 def _ended(force: float, unit: str, status: Status) -> str:
-    return f"force {force:g} {unit}: {status.message}."
+    return f"force {force:g} {unit}: a curve {status.message}."
 
 
 def _not_followed(status: Status) -> str:
@@ -38,6 +38,8 @@ def _equilibria(
     ]
     several = "one further equilibrium" if len(listed) == 1 else f"{len(listed)} further equilibria"
     start = "rest" if rest == 0.0 else f"the one at {1e3 * rest:.3g} mm"
+    if any(stable):
+        start += ", and responses also from the stable ones that the force does not drive it out of"
     return f"the model has {several}, at {sensor}: {enumerated(listed)}. Curves start from {start}."
 
 
@@ -141,7 +143,10 @@ SENTENCES: dict[str, Wording] = {
         "no quasi-periodic motions were followed from {frequency_hz:.5g} Hz at force {force:g}: "
         "{why}"
     ),
-    "no_event_to_follow": "no response has a {event} to follow.",
+    "no_event_to_follow": (
+        "no response has a {event} to follow in this range of frequencies: it may lie outside, or "
+        "another force has it."
+    ),
     "harmonics_left_out": (
         "the harmonics above {harmonics} would change the velocity by up to about {fraction:%.2g} "
         "somewhere; use more --harmonics."

@@ -43,6 +43,7 @@ class CurveStatus(Status):
         7,
         "not traced: the force or a parameter of the model is not finite, or the force is zero",
     )
+    BRANCH_POINT = 8, "ended at a branch point, on another curve"
 
 
 class StepControl(eqx.Module):

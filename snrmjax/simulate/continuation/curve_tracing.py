@@ -192,14 +192,16 @@ def trace_both_ways(
 
 
 def lies_on(
-    point: Float[np.ndarray, " unknown"], curve: Float[np.ndarray, "point unknown"]
+    point: Float[np.ndarray, " unknown"],
+    curve: Float[np.ndarray, "point unknown"],
+    near: float = _NEAR,
 ) -> bool:
-    """Whether a scaled point lies on the polyline through a curve's points."""
+    """Whether a scaled point lies on the polyline through a curve's points, or as `near` to it."""
     begin, step = curve[:-1], np.diff(curve, axis=0)
     square = np.maximum(np.sum(step**2, axis=1), 1e-300)
     along = np.clip(np.sum((point - begin) * step, axis=1) / square, 0.0, 1.0)
     nearest = np.linalg.norm(begin + along[:, None] * step - point, axis=1)
-    return bool(np.min(nearest, initial=np.inf) < _NEAR)
+    return bool(np.min(nearest, initial=np.inf) < min(near, _NEAR))
 
 
 def trace_through(

@@ -30,6 +30,10 @@ from snrmjax.simulate.continuation.stability import (
     stability_of,
 )
 
+_CHANGES_STABILITY = {
+    *(CurveEvent.FOLD, CurveEvent.BRANCH_POINT),
+    *(CurveEvent.PERIOD_DOUBLING, CurveEvent.NEIMARK_SACKER),
+}
 _NARROW = 1e-4  # relative width of a gap in stability that exceeds a step of the curve
 
 
@@ -96,6 +100,7 @@ class Branch(StrEnum):
     EQUILIBRIUM = "from another equilibrium"
     BEYOND = "from beyond a resonance outside the range"
     LANDING = "where a sweep lands"
+    BRANCH_POINT = "from a branch point"
     REST = "isolated, from a motion about rest"
     RANDOM_START = "isolated, from a random start"
 
@@ -266,8 +271,10 @@ def without_stable_response(
         return []
     spans = []
     for curve in curves:
+        # At a bifurcation or fold itself a motion counts as the stable ones next to it.
+        changes = np.array([event in _CHANGES_STABILITY for event in curve.event], dtype=bool)
         stable = curve.stability == int(Stability.STABLE)
-        both = stable[1:] & stable[:-1]
+        both = (stable | changes)[1:] & (stable | changes)[:-1] & (stable[1:] | stable[:-1])
         pair = np.stack([curve.frequency[:-1], curve.frequency[1:]], axis=1)[both]
         spans += np.sort(pair, axis=1).tolist()
     gaps, reached = [], from_frequency

@@ -17,8 +17,8 @@ from snrmjax.numerics.lanes import lanes_for
 from snrmjax.numerics.result import AbstractResult, quantity
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
-from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
-from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import response_balances
 from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.continuation.response_curve import (
@@ -27,11 +27,15 @@ from snrmjax.simulate.continuation.response_curve import (
     assembled,
     without_stable_response,
 )
+from snrmjax.simulate.solutions.branch_switching import add_branches
 from snrmjax.simulate.solutions.from_rest import curves_from_rest, curves_where_sweeps_land
 
 DEFAULT_STEPS = StepControl()
 _AT_FOLD = 1e-3  # relative distance in frequency of a fold and the last stable point
-_WHOLE = (CurveStatus.UPPER_END, CurveStatus.LOWER_END, CurveStatus.CLOSED)
+_WHOLE = (
+    *(CurveStatus.UPPER_END, CurveStatus.LOWER_END),
+    *(CurveStatus.CLOSED, CurveStatus.BRANCH_POINT),
+)
 
 
 class ResponseSettings(eqx.Module):
@@ -80,8 +84,10 @@ def forced_response(
     but has no start there. If the curve from the lower end does not reach the upper one, it is
     traced from the upper end instead, and if that does not reach the lower end either, both parts
     are returned, a part without a start being empty. If a resonance extends beyond
-    `to_frequency`, the branch that enters there from the linear response is returned too. For
-    isolated branches and further potential wells see `isolated_responses`.
+    `to_frequency`, the branch that enters there from the linear response is returned too, and so
+    are those from further stable equilibria, from branch points at which a curve loses its
+    stability, and where a sweep lands beyond a fold. For isolated branches see
+    `isolated_responses`.
     Raises `ValueError` for a force that is not positive and for an empty or infinite frequency
     range.
     Not differentiable: call it outside, and differentiate single motions of its curve:
@@ -263,17 +269,32 @@ def _chunk_of_curves(
     for k, branch, response in zip(owner, branches, responses, strict=True):
         results[good[k]].append(dataclasses.replace(response, branch=branch))
     for i, (k, one) in enumerate(zip(good, from_rest, strict=True)):
-        folds = _left_folds(results[k], ends)
-        if folds:
-            new = curves_where_sweeps_land(balances, i, one.curves, folds, ends, settings.steps)
-            own = taken(balances, np.full(len(new), i))
-            landed = assembled(own, new, settings.steps, branch=Branch.LANDING) if new else []
-            results[k] += [curve for curve in landed if np.any(curve.is_stable)]
+        _add_where_sweeps_go(results[k], one.curves, balances, i, ends, settings.steps)
         if one.has_no_start:
             first = results[k][0]
             missed = (*first.not_located, "branch")
             results[k][0] = dataclasses.replace(first, not_located=missed)
     return [tuple(curves) for curves in results]
+
+
+def _add_where_sweeps_go(
+    curves: list[ResponseCurve],
+    traced: Sequence[TracedCurve],
+    balances: HarmonicBalance,
+    member: int,
+    ends: Float[np.ndarray, " end"],
+    steps: StepControl,
+) -> None:
+    """Add curves on which a sweep goes on beyond branch points and folds of a member's curves."""
+
+    known = [one.points for one in traced]
+    add_branches(curves, known, balances, member, ends, steps)
+    folds = _left_folds(curves, ends)
+    new = curves_where_sweeps_land(balances, member, known, folds, ends, steps) if folds else []
+    if new:
+        own = taken(balances, np.full(len(new), member))
+        landed = assembled(own, new, steps, branch=Branch.LANDING)
+        curves.extend(curve for curve in landed if np.any(curve.is_stable))
 
 
 def _left_folds(

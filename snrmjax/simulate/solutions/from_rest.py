@@ -26,7 +26,6 @@ from snrmjax.simulate.continuation.curve_tracing import (
 )
 from snrmjax.simulate.continuation.response_curve import Branch
 
-_N_STARTS = 24  # of the search for further equilibria; few, as every response pays for it
 _MARGIN = 0.5  # factor on the criterion that excludes further equilibria in a direction
 _NEAR_LINEAR = 0.5  # relative difference from the linear response of a motion from rest
 # Resonances outside the range are included where their hysteresis may extend into it: a softening
@@ -79,27 +78,28 @@ def curves_from_rest(
 def curves_where_sweeps_land(
     balances: HarmonicBalance,
     member: int,
-    known: Sequence[TracedCurve],
+    known: Sequence[Float[np.ndarray, "point unknown"]],
     folds: Sequence[tuple[float, float]],
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
 ) -> list[TracedCurve]:
     """Further curves of one member on which a sweep lands beyond a fold of the known ones.
 
-    They need not reach an end of the range. Arguments: `folds` are frequencies (rad/s) of folds and
-    of the other end of the range without stable response. Motions are sought just beyond the fold,
-    over a force raised past its value.
+    They need not reach an end of the range. Arguments: scaled points of `known` curves; `folds` are
+    frequencies (rad/s) of folds and of the other end of the range without stable response. Motions
+    are sought just beyond the fold, over a force raised past its value.
     """
     curves: list[TracedCurve] = []
     own = taken(balances, np.array([member]))
     for fold, beyond in folds:
         for point in at_force(own, 0, fold + _INSIDE * (beyond - fold), steps, 1):
-            if any(lies_on(point, one.points) for one in (*known, *curves)):
+            every = [*known, *(one.points for one in curves)]
+            if any(lies_on(point, points) for points in every):
                 continue
             curve = trace_both_ways(own, point, ends, steps)
             # The point was interpolated: the curve traced from it may be a known one.
             middle = curve.points[len(curve.points) // 2 :][:1]
-            if len(middle) and not any(lies_on(middle[0], one.points) for one in (*known, *curves)):
+            if len(middle) and not any(lies_on(middle[0], points) for points in every):
                 curves.append(curve)
     return curves
 
@@ -184,7 +184,7 @@ def _add_other_equilibria(
     """Add new curves from further stable equilibria, from both ends."""
     owners, rests = [], []
     for k in np.flatnonzero(_may_have_other_equilibria(models)).tolist():
-        for other in equilibria(models[k], n_starts=_N_STARTS):
+        for other in equilibria(models[k]):
             if other.stable and np.any(other.displacement):
                 owners.append(k)
                 rests.append(other.displacement)

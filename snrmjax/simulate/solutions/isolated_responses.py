@@ -24,6 +24,7 @@ from snrmjax.simulate.continuation.curve_tracing import (
     trace_both_ways,
 )
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, assembled
+from snrmjax.simulate.solutions.branch_switching import add_branches
 from snrmjax.simulate.solutions.controlled import phase_controlled
 from snrmjax.simulate.solutions.forced_response import (
     DEFAULT_SETTINGS,
@@ -158,6 +159,8 @@ def isolated_responses(
         isolated += assembled(
             balances, [traced], settings.steps, stability=stability, branch=origin
         )
+    if settings.stability:
+        add_branches(isolated, curves, balances, 0, ends, settings.steps)
     return IsolatedResponses(
         curves=tuple(isolated),
         force=load,

@@ -201,6 +201,26 @@ def test_damping_of_a_fine_mesh_is_no_small_difference(n):
     assert result == pytest.approx(wanted, rel=1e-6, abs=std)
 
 
+def test_a_sum_of_mass_and_stiffness_of_equal_elements_is_within_its_stated_error():
+    # All entries of a diagonal round alike: a M is 90 units in the last digit of b K.
+    n, stiffness = 10_000, 100.0
+    h = 1.0 / (n + 1)
+    second = scipy.sparse.diags_array(
+        [1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(n, n), format="csc"
+    )
+    k, m = stiffness / h**3 * (second @ second), h * scipy.sparse.eye_array(n, format="csc")
+    # Of the hinged beam of finite differences, mode by mode.
+    omega = np.sqrt(stiffness) * (2 - 2 * np.cos(np.pi * h * np.array([1, 2]))) / h**2
+    a, b = 1.8, 2e-5
+    model = from_matrices(m, a * m + b * k, k, force="x5", n_modes=2, sensors=["x5"])
+    ratio, std = (
+        np.asarray(part[:2]) for part in (model.modes.damping_ratio, model.modes.damping_ratio_std)
+    )
+    wanted = a / (2 * omega) + b * omega / 2
+    assert np.all(np.abs(ratio - wanted) < std)
+    assert np.all(std < 0.03 * wanted)
+
+
 @pytest.mark.parametrize(
     ("springs", "dampers", "message"),
     [([1.0, 1.0], 0.0, "`springs` must have 3"), ([1.0] * 3, [0.1], "`dampers` must have 3")],

@@ -104,6 +104,88 @@ def test_each_stable_rest_has_its_response():
     assert peaks[0] == pytest.approx(peaks[1], rel=1e-4)
 
 
+def settled_velocity(force, hertz, cycles=20, steps=64):
+    """|V₁| and the mean of q̈ + 2ζq̇ + q − q³ = F cos Ωt after a slow sweep; Runge–Kutta."""
+
+    def rate(y, load):
+        return np.array([y[1], force * load - 0.04 * y[1] - y[0] + y[0] ** 3])
+
+    y, wave = np.array([0.0, 0.0]), np.cos(np.pi * np.arange(2 * steps + 1) / steps)
+    for omega in hertz * HERTZ:
+        h = 2 * np.pi / omega / steps
+        for _ in range(cycles):
+            y[0] += 1e-6  # off the symmetric motion
+            rows = []
+            for k in range(steps):
+                rows.append(y)
+                one = rate(y, wave[2 * k])
+                two = rate(y + h / 2 * one, wave[2 * k + 1])
+                three = rate(y + h / 2 * two, wave[2 * k + 1])
+                four = rate(y + h * three, wave[2 * k + 2])
+                y = y + h / 6 * (one + 2 * two + 2 * three + four)
+    q, v = np.array(rows).T
+    return 2 * abs(np.mean(v * np.exp(-2j * np.pi * np.arange(steps) / steps))), np.mean(q)
+
+
+def test_a_sweep_goes_on_where_the_symmetry_breaks():
+    """Softening Duffing at F = 0.2: below 0.1243 Hz the mean of the stable motion is not zero."""
+    modes = sj.model.linear_modes([1.0], [0.02], [[1.0]], [1.0])
+    model = sj.model.structure(modes, sj.model.polynomial_potential({(0,) * 4: -0.25}, 1))
+    found = simulate_responses(model, [0.2026], 0.118, 0.14, harmonics=7)
+    at = 0.1234
+    velocity, mean = settled_velocity(0.2026, np.append(np.linspace(0.2, at, 60), [at] * 9))
+    assert abs(mean) > 0.05
+    (left,) = [note for note in found.notes if note.kind == "no_stable_response"]
+    assert left["to_hz"] < at
+    branches = [curve for curve in found.curves if curve.branch == "from a branch point"]
+    means = []
+    for branch in branches:
+        assert branch.event[0] == "branch_point"
+        assert not branch.at_events("fold").size
+        assert branch.not_located == ()
+        order = np.argsort(branch.frequency)
+        hertz = branch.frequency[order] / HERTZ
+        assert branch.is_stable[order][np.searchsorted(hertz, at)]
+        seen = np.interp(at, hertz, np.abs(branch.velocity[order, 1, 0]))
+        assert seen == pytest.approx(velocity, rel=2e-3)  # interpolated between two points
+        means.append(np.interp(at, hertz, branch.coefficients[order, 0, 0]))
+    assert sorted(means) == pytest.approx([-abs(mean), abs(mean)], rel=2e-2)
+
+
+def test_the_branch_of_a_mode_without_force_ends_at_its_other_branch_point():
+    """The force drives q₁ alone; q₂ moves between two branch points of the motion with q₂ = 0."""
+    modes = sj.model.linear_modes([1.0, 1.05], [0.01, 0.01], [[1.0, 0.3]], [1.0, 0.0])
+    coupled = {(0,) * 4: 0.25, (0, 0, 1, 1): 0.8, (1,) * 4: 0.25}
+    model = sj.model.structure(modes, sj.model.polynomial_potential(coupled, 2))
+    main, *branches = sj.forced_response(model, [0.02], 0.8, 1.4, harmonic_order=3)
+    ends = main.frequency[main.at_events("branch_point")]
+    assert len(ends) == len(branches) == 2
+    for branch in branches:
+        assert branch.status.name == "BRANCH_POINT"
+        ends_of_branch = branch.frequency[[0, -1]]
+        assert np.sort(ends_of_branch) == pytest.approx(np.sort(ends), rel=1e-4)
+        assert np.abs(branch.coefficients[:, 1, 1]).max() > 0.1
+    # The two are each other's image under q₂ → −q₂.
+    heights = [np.abs(b.coefficients[:, 1:3, 1]).max() for b in branches]
+    assert heights[0] == pytest.approx(heights[1], rel=2e-2)
+
+
+def test_a_far_well_has_its_response_too():
+    """V = ω²(½q₁² + ½ 2.02² q₂² + q₁²q₂ + 0.02 q₁⁴ + 0.1 q₂⁴): far wells at q₁ = ±12.661."""
+    omega = 0.2 * np.pi
+    modes = sj.model.linear_modes([omega, 2.02 * omega], [0.02, 0.02], [[1.0, 0.5]], [1.0, 0.5])
+    terms = {(0, 0, 1): 1.0, (0,) * 4: 0.02, (1,) * 4: 0.1}
+    potential = sj.model.polynomial_potential({k: c * omega**2 for k, c in terms.items()}, 2)
+    q1, q2 = 12.66112355, -6.91216198
+    assert q1 + 2 * q1 * q2 + 0.08 * q1**3 == pytest.approx(0.0, abs=1e-5)
+    assert 2.02**2 * q2 + q1**2 + 0.4 * q2**3 == pytest.approx(0.0, abs=1e-5)
+    curves = sj.forced_response(
+        sj.model.structure(modes, potential), [0.01], 1.5 * omega, 1.7 * omega, harmonic_order=3
+    )
+    means = [c.coefficients[0, 0] for c in curves if c.branch == "from another equilibrium"]
+    assert sorted(row[0] for row in means) == pytest.approx([-q1, q1], rel=1e-3)
+
+
 @pytest.mark.parametrize("slides", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_simulation_reports_inactive_elements(slides):
     kind, parameters = (
