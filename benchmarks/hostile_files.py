@@ -4,7 +4,8 @@ Run: python benchmarks/hostile_files.py [--runs 20000] [--seed 0] [--only KIND]
 
 Valid files of every format (UFF 58, 58b and 55, MATLAB v4, v5 and v7.3, HDF5, netCDF, TDMS, CSV in
 two dialects, a LabVIEW measurement file, runs side by side, a vibrometer's export, thousands, times
-of few digits, levels in dB, objects of MATLAB, Octave's text, a start and a step) are mutated:
+of few digits, levels in dB, objects of MATLAB, Octave's text, a start and a step, units by row,
+odd time steps, one force for all rows) are mutated:
 cut, bits flipped, counts made huge, runs overwritten, NaN put in, parts doubled, text for binary,
 two formats spliced, gzip and zip around them, one in another. Each is
 listed, and what it holds is read and imported, in a child process whose address space may grow by
@@ -177,6 +178,23 @@ def write_other_customs(folder, rng, hertz):
     text += ["# name: c", "# type: cell", "# rows: 1", "# columns: 1", "# name: <cell-element>"]
     text += ["# type: string", "# elements: 1", "# length: 3", "tip", "", "", ""]
     (folder / "l.mat").write_text("\n".join(text))
+    write_times_and_units_by_row(folder, rng, hertz)
+
+
+def write_times_and_units_by_row(folder, rng, hertz):
+    """A unit after each number, one in a column, one odd time step, one force for all rows."""
+    import scipy.io
+
+    rows = [f"{f!r} Hz,0.1 N,{f / 80!r} mm/s,{f!r} deg" for f in hertz.tolist()]
+    (folder / "m.csv").write_text("\n".join(["f,F,v,phase", *rows]))
+    rows = [f"{f!r},0.1,{f / 80!r},mm/s,{f!r}" for f in hertz.tolist()]
+    (folder / "n.csv").write_text("\n".join(["f [Hz],F [N],v,unit,phase [deg]", *rows]))
+    times = np.arange(300) / 1000 + 0.0004 * (np.arange(300) > 150)
+    rows = [f"{t:.4f},{v!r}" for t, v in zip(times, rng.normal(size=300).tolist(), strict=True)]
+    (folder / "o.csv").write_text("\n".join(["Time [s],v [m/s]", *rows]))
+    scipy.io.savemat(folder / "p.mat", {"freq": hertz, "F": 0.1, "v": hertz + 1j})
+    levels = {"freq": hertz[:, None], "F": [[0.1, 0.2]], "v": np.stack([hertz, hertz**2], axis=1)}
+    scipy.io.savemat(folder / "q.mat", levels)
 
 
 def object_of_matlab():
@@ -194,6 +212,9 @@ def object_of_matlab():
 def invented(path, held):
     """A number that a text does not have, or nothing: each that was read must stand there."""
     if path.suffix not in (".lvm", ".txt", ".csv"):
+        return ""
+    is_resampled = any(note.kind == "time_resampled" for note in held.notes)
+    if is_resampled or path.name.endswith(("m.csv", "n.csv")):  # with units by row
         return ""
     text = path.read_bytes().decode("cp1252", errors="replace")
     fields = re.split(r"[\t;\s\"]+", text) + re.split(r"[\t;,\s\"]+", text)

@@ -21,6 +21,9 @@ def parsed_toml(text: str, file: str) -> "TomlTable":
         raise InputError(f"{file} is not valid TOML: it nests too deeply.") from error
 
 
+_MOST_LISTED = 8  # keys in a message
+
+
 class TomlTable(NamedTuple):
     """A table of a file, with its location for messages."""
 
@@ -39,6 +42,8 @@ class TomlTable(NamedTuple):
         for key in self.entries:
             if key not in known:
                 near = suggestion(key, missing) or suggestion(key, known)
+                if not near and known and len(known) <= _MOST_LISTED:
+                    near = f": it may have {', '.join(known)}"
                 raise InputError(f"{self.location} has the unknown key {shown(key)}{near}.")
         if missing:
             raise InputError(f"{self.location} lacks the key `{missing[0]}`.")

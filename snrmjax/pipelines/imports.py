@@ -34,4 +34,4 @@ def list_contents(files: Sequence[FilePath], **options: Any) -> list[str]:
     contents = [read_laboratory_file(path, stated.text_format, stated.even_axis) for path in paths]
     refuse_unused_axis([key for key, value in options.items() if value], contents)
     lines = [line for one in contents for line in listed_contents(one)]
-    return [*lines, *proposed_commands(paths, contents)]
+    return [*lines, *proposed_commands(paths, contents, stated)]

@@ -115,6 +115,13 @@ def _as_stated(sources: ModalSources, options: ModesOptions) -> ModalSources:
     Raises `ValueError` for records whose few digits do not determine their rate.
     """
     if isinstance(sources, FrequencyResponses):
+        for channel in sources.responses:
+            if channel.quantity == "unknown":
+                raise InputError(
+                    f"the file does not state the quantity of {channel.name}: import it with the "
+                    f"force 1 (`snrmjax import FILE --response {channel.name}:QUANTITY:UNIT "
+                    "--force-amplitude 1 --out DIR`), and give `modes` the measured.csv."
+                )
         values = sources.values.conj() if options.conjugated else sources.values
         return dataclasses.replace(sources, values=values)
     if isinstance(sources, SteadyStates):

@@ -209,6 +209,17 @@ class DecayFit(NamedTuple):
         """Measured less fitted, in the channels' units."""
         return self.fit.residuals * self.scale[:, None]
 
+    @property
+    def change(self) -> float:
+        """χ² of the amplitude dependence."""
+        rows = slice(2 * self.form.n_modes, None)
+        terms, covariance = self.unknowns[rows], self.fit.covariance[rows, rows]
+        if not terms.size:
+            return 0.0
+        scale = np.sqrt(np.diag(covariance))
+        scaled = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-8, hermitian=True)
+        return float(terms / scale @ scaled @ (terms / scale))
+
     def energy(self, time: Float[np.ndarray, " sample"]) -> Float[np.ndarray, " mode"]:
         """Energy of every mode over the record, in units of the noise."""
         falls = np.exp(-2 * time[:, None] * self.natural_frequency * self.damping_ratio)

@@ -275,7 +275,7 @@ class AcceptedModes(NamedTuple):
     decay: DecayFit
     kept: np.ndarray
     first: int = 0
-    spread: np.ndarray = np.zeros(2)  # additional 1σ of ω and ζ of the leading mode
+    spread: np.ndarray = np.zeros((2, 1))  # additional 1σ of ω and ζ of the modes
     notes: tuple[Fact, ...] = ()
 
 
@@ -348,18 +348,20 @@ def _result(
     kept = np.flatnonzero(modes.kept)
     rank = kept[np.argsort(unknowns[kept])]
     covariance = np.stack([fit.covariance[np.ix_([k, n + k], [k, n + k])] for k in rank])
-    covariance[rank == modes.decay.form.leading, (0, 1), (0, 1)] += modes.spread**2
+    spread = np.broadcast_to(modes.spread, (2, n))[:, rank].T
+    covariance[:, (0, 1), (0, 1)] += spread**2
     n_channels = len(channels)
     values = values[:, modes.first :]
     time = np.arange(values.shape[1]) / rate
     fitted = values - modes.decay.residuals
     amplitude = modes.decay.amplitude[:n_channels, rank]
-    spread = modes.decay.amplitude_std[:n_channels, rank]
+    amplitude_std = modes.decay.amplitude_std[:n_channels, rank]
     top = np.argmax(np.abs(amplitude), axis=0)
     n = len(rank)
     largest = amplitude[top, np.arange(n)]
     ratio = amplitude / largest
-    shape_std = np.hypot(spread, np.abs(ratio) * spread[top, np.arange(n)]) / np.abs(largest)
+    shape_std = np.hypot(amplitude_std, np.abs(ratio) * amplitude_std[top, np.arange(n)])
+    shape_std /= np.abs(largest)
     shape_std[top, np.arange(n)] = 0.0
     collinearity, _ = phase_collinearity(ratio)
     notes = list(modes.notes) + [

@@ -127,7 +127,7 @@ def basis_settings(
     time = None
     if window is not None:
         if window != "hann":
-            raise InputError(f"`window` must be 'hann' or None, but is {window!r}.")
+            raise InputError(f"`window` must be 'hann' or not stated, but is {window!r}.")
         spacing = np.diff(data.omega)
         step = float(np.median(spacing))
         # Lines may be missing, but must lie on a grid.
@@ -178,7 +178,10 @@ def _start(
             inside & (of_order.real < 0) & (-of_order.real < LIGHTLY_DAMPED * np.abs(of_order))
         ]
         if not of_order.size:
-            raise InputError(f"model order {order} has no lightly damped pole in the band.")
+            raise InputError(
+                f"model order {order} has no lightly damped pole in the band: state a higher "
+                "`order`, or none."
+            )
         return of_order[np.argsort(np.abs(of_order))]
     stable = clusters(orders, band)
     damped, growing = stable[stable.real < 0], stable[stable.real > 0]

@@ -33,6 +33,7 @@ _MEDIAN_OF_POWER = float(np.log(2))  # median over mean of the power in a spectr
 _NOISE_BANDS = 16
 # Dry friction: the last halvings of the amplitude take less and less time.
 _FALLS, _SHORTER, _MUCH_LONGER = 3, 0.93, 1.5
+_DRY = "its damping grows as the motion falls, as dry friction has it"
 _HALVINGS = 10  # of the amplitude, from the first part to the last
 _FEWEST_SAMPLES, _FEWEST_CYCLES = 60, 8
 _MOST_MODES, _MORE_MODES = 6, 2  # of linear modes, and added to an amplitude-dependent mode
@@ -62,20 +63,23 @@ class PartFit(NamedTuple):
     seconds: float  # from there to the end
     fitted: DecayFit
     settled: bool  # only noise is left in the samples before the next later part
-    change: float  # χ² of the amplitude dependence
-    spread: Float[np.ndarray, "2"]  # 1σ of ω and ζ of the leading mode from the choice of powers
+    spread: Float[np.ndarray, "2 mode"]  # 1σ of ω and ζ from the choice of powers
 
     @property
     def depends_on_amplitude(self) -> bool:
         """Whether rates depend significantly on the amplitude."""
-        return self.change > _SIGNIFICANT_CHANGE
+        return self.fitted.change > _SIGNIFICANT_CHANGE
+
+    def values(self) -> tuple[np.ndarray, np.ndarray]:
+        """ω and ζ of all modes at zero amplitude, and their 1σ; both of shape (2, mode)."""
+        n = self.fitted.form.n_modes
+        std = np.sqrt(np.diag(self.fitted.fit.covariance)[: 2 * n].reshape(2, n))
+        return self.fitted.unknowns[: 2 * n].reshape(2, n), np.hypot(std, self.spread)
 
     def limit(self) -> tuple[np.ndarray, np.ndarray]:
         """ω and ζ of the leading mode at zero amplitude, and their 1σ."""
-        k, n = self.fitted.form.leading, self.fitted.form.n_modes
-        rows = [k, n + k]
-        std = np.sqrt(np.diag(self.fitted.fit.covariance)[rows])
-        return self.fitted.unknowns[rows], np.hypot(std, self.spread)
+        value, std = self.values()
+        return value[:, self.fitted.form.leading], std[:, self.fitted.form.leading]
 
 
 def noise_of_channels(values: Float[np.ndarray, "channel sample"]) -> Float[np.ndarray, " channel"]:
@@ -151,8 +155,7 @@ def parts_of_decay(
     begins = _begins(amplitude, omega, rate)
     if _halving_accelerates(begins):
         last = begins[-_FALLS], omega  # the motion may have stopped afterwards
-        why = "its damping grows as the motion falls, as dry friction has it"
-        raise InputError(_refusal([], last, values, rate, why))
+        raise InputError(_refusal([], last, values, rate, _DRY))
     parts: list[PartFit] = []
     for number, first in enumerate(reversed(begins), 1):
         part = values[:, first:]
@@ -166,8 +169,7 @@ def parts_of_decay(
         fitted, spread = fit_and_spread
         added = fitted.residuals[:, : None if later is None else later.first - first]
         settled = _of_noise(added, noise)
-        change = _chi_square_of_change(fitted)
-        parts.append(PartFit(first, float(time[-1]), fitted, settled, change, spread))
+        parts.append(PartFit(first, float(time[-1]), fitted, settled, spread))
         if later is not None and later.settled and not settled:
             break
     return parts[::-1]
@@ -278,15 +280,15 @@ def _with_better_powers(base: DecayFit, part: np.ndarray, time: np.ndarray) -> l
 
 
 def _spread_of(trials: list[DecayFit], fitted: DecayFit) -> np.ndarray:
-    """1σ of ω and ζ of the leading mode over fits of other powers, weighted by probability."""
+    """1σ of ω and ζ of the modes over fits of other powers, weighted by probability."""
     k, n = fitted.form.leading, fitted.form.n_modes
-    rows, total, square = [k, n + k], 1.0, np.zeros(2)
+    total, square = 1.0, np.zeros(2 * n)
     for one in trials:
         if one.form.n_modes == n and one.form.leading == k and one is not fitted:
             weight = float(np.exp(min((one.information - fitted.information) / 2, 0.0)))
-            square = square + weight * (one.unknowns[rows] - fitted.unknowns[rows]) ** 2
+            square = square + weight * (one.unknowns[: 2 * n] - fitted.unknowns[: 2 * n]) ** 2
             total += weight
-    return np.sqrt(square / total)
+    return np.sqrt(square / total).reshape(2, n)
 
 
 def _leading_mode_only(fitted: DecayFit, part: np.ndarray, time: np.ndarray) -> DecayFit:
@@ -339,7 +341,7 @@ def small_motion(
 
     Accepted are the leading mode and those also present in the next later part: residuals of an
     amplitude-dependent mode can appear as modes. The 1σ includes the choice of powers and the
-    difference from the next later part.
+    difference from the next later part, of all modes.
     Raises `ValueError` if rates depend on the amplitude and the limit is not in the record.
     """
     dependent = [part for part in parts if part.depends_on_amplitude]
@@ -350,10 +352,7 @@ def small_motion(
         if not part.settled:
             break
         if chosen is not None:
-            (here, std), (there, there_std) = part.limit(), chosen.limit()
-            off = np.abs(here - there)
-            beyond = np.sqrt(np.maximum(off**2 - np.maximum(there_std**2 - std**2, 0.0), 0.0))
-            part = part._replace(spread=np.hypot(part.spread, beyond))
+            part = part._replace(spread=np.hypot(part.spread, _beyond(part, chosen)))
         chosen, before = part, chosen
     if chosen is None:
         raise InputError(_refusal(parts, last, values, rate, "no part of it is explained"))
@@ -366,8 +365,7 @@ def small_motion(
     fitted = chosen.fitted
     with_friction = [_with_powers(fitted, powers, here, time) for powers in _FRICTION]
     if max(one.information for one in with_friction) > fitted.information + _BETTER:
-        why = "its damping grows as the motion falls, as dry friction has it"
-        raise InputError(_refusal(parts, last, values, rate, why))
+        raise InputError(_refusal(parts, last, values, rate, _DRY))
     value, std = chosen.limit()
     change = np.abs(_at_the_end(fitted, time) / value - 1)
     if value[1] <= 0 or np.any(change > _LARGEST_CHANGE) or np.any(std / value > _NOT_KNOWN):
@@ -379,6 +377,17 @@ def small_motion(
         kept &= np.abs(fitted.natural_frequency[:, None] / later - 1).min(axis=1) < _SAME
     kept[fitted.form.leading] = True
     return chosen, kept
+
+
+def _beyond(part: PartFit, later: PartFit) -> np.ndarray:
+    """Differences of ω and ζ of all modes from a later part, beyond its larger errors.
+
+    Rates of other modes may also depend on the amplitude of the leading one.
+    """
+    (here, std), (there, there_std) = part.values(), later.values()
+    same = np.argmin(np.abs(here[0][:, None] / there[0] - 1), axis=1)
+    wider = np.maximum(there_std[:, same] ** 2 - std**2, 0.0)
+    return np.sqrt(np.maximum((here - there[:, same]) ** 2 - wider, 0.0))
 
 
 def _refusal(
@@ -393,6 +402,7 @@ def _refusal(
     `last_begin` is the first sample of the last part and a frequency in rad/s near the mode's.
     """
     begin, omega = last_begin
+    begin = begin or max(values.shape[1] - int(_CYCLES_OF_LINE * HERTZ / omega * rate), 0)
     first, last = (frequency_at(values, at, rate, omega) for at in (0, begin))
     words = "no part of the record is linear within noise"
     linear = [part for part in parts if not part.depends_on_amplitude and part.settled]
@@ -408,8 +418,9 @@ def _refusal(
         "the decay is not that of linear modes: frequency or damping change as the motion falls "
         f"({first:.5g} Hz at the largest value, {last:.5g} Hz {begin / rate:.4g} s later), and "
         f"{why}, so that their values at zero amplitude are not known. {words[0].upper()}"
-        f"{words[1:]}. A longer record with less noise reaches smaller motion; `snrmjax compare` "
-        "gives frequency and damping over the amplitude."
+        f"{words[1:]}. "
+        + ("" if why == _DRY else "A longer record with less noise reaches smaller motion; ")
+        + "`snrmjax compare` gives frequency and damping over the amplitude."
     )
 
 
@@ -419,11 +430,11 @@ def frequency_at(
     """Frequency (Hz) of the strongest line over some cycles of `omega` from a sample on."""
     length = int(_CYCLES_OF_LINE * HERTZ / omega * rate)
     part = values[:, first : first + length]
-    part = part - part.mean(axis=1, keepdims=True)
     padded = 16 * part.shape[1]
     spectrum = np.fft.rfft(part * np.hanning(part.shape[1]), padded, axis=1)
     power = np.sum(np.abs(spectrum) ** 2, axis=0)
-    return float(np.argmax(power)) * rate / padded
+    lowest = int(0.5 * omega / HERTZ / rate * padded)  # below are offsets of a motion that stopped
+    return float(lowest + np.argmax(power[lowest:])) * rate / padded
 
 
 def _at_the_end(fitted: DecayFit, time: np.ndarray) -> np.ndarray:
@@ -436,14 +447,3 @@ def _at_the_end(fitted: DecayFit, time: np.ndarray) -> np.ndarray:
     omega, ratio = fitted.unknowns[[k, n + k]]
     rate, damped = omega * ratio + decay, omega * np.sqrt(1 - ratio**2) + rotation
     return np.array([np.hypot(damped, rate), rate / np.hypot(damped, rate)])
-
-
-def _chi_square_of_change(fitted: DecayFit) -> float:
-    rows = slice(2 * fitted.form.n_modes, None)
-    terms = fitted.unknowns[rows]
-    if not terms.size:
-        return 0.0
-    covariance = fitted.fit.covariance[rows, rows]
-    scale = np.sqrt(np.diag(covariance))
-    scaled = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-8, hermitian=True)
-    return float(terms / scale @ scaled @ (terms / scale))

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.laboratory.contents import NumberTable
-from snrmjax.io.laboratory.physical_units import level_reference
+from snrmjax.io.laboratory.physical_units import level_reference, unit_meaning
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
 
@@ -42,9 +42,11 @@ def with_stated_references(
         if values is None or (of_file is None and of_map is None):
             continue
         if of_map is None and unit_of_map:
+            of_volts = bool(of_file) and unit_meaning(of_file).dimension == "voltage"
+            which = " (the amplitude that 1 V stands for)" if of_volts else ""
             raise InputError(
                 f"{name} of {file} is in {unit_of_file}, not in {unit_of_map}: state the reference "
-                f"of the level in place of its unit, as 'dB re 1 {unit_of_map}'."
+                f"of the level in place of its unit, as 'dB re 1 {unit_of_map}'{which}."
             )
         if not (of_map or of_file):
             raise InputError(

@@ -30,6 +30,10 @@ _OTHERS = (
     *("frequency", "force", "drive", "phase", "imaginary", "level", "deviation", "time", "mark"),
     "coherence",
 )
+_OF_READING = (
+    *("separator", "decimal", "header_row", "dataset", "rate"),
+    *("frequency_start", "frequency_step"),
+)
 _TRIED = 2**21  # longest record (samples) for a trial import as steps or sweeps
 _RADIANS = 1.01 * np.pi  # largest magnitude of wrapped phases in radians
 _LEAST_PHASE_RANGE = 1.0  # least phase range (rad) across a resonance
@@ -48,8 +52,9 @@ class _Options(dict[str, Any]):
         """As command-line arguments."""
         for key, value in self.items():
             for word in value if isinstance(value, list) else [value]:
+                text = f"{word:.10g}" if isinstance(word, float) else str(word)
                 yield f"--{key.replace('_', '-')}" + (
-                    "" if word is True else f" {shlex.quote(word)}"
+                    "" if word is True else f" {shlex.quote(text)}"
                 )
 
     def mapping(self) -> ImportMap:
@@ -57,11 +62,14 @@ class _Options(dict[str, Any]):
         return map_of_options(None, self)
 
 
-def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) -> list[str]:
+def proposed_commands(
+    paths: Sequence[Path], files: Sequence[LaboratoryFile], stated: ImportMap | None = None
+) -> list[str]:
     """Lines with the command that imports the files of one test, and its open questions.
 
     Words in capitals are to be filled in: neither the files nor their column names state them. A
-    command without such words was tried on the files.
+    command without such words was tried on the files. It repeats the options `stated` for the
+    reading of the files.
     """
     named = " ".join(shlex.quote(str(path)) for path in paths)
     source = joined_files(files)[0]
@@ -76,9 +84,15 @@ def proposed_commands(paths: Sequence[Path], files: Sequence[LaboratoryFile]) ->
         return ["state the frequencies of the responses (fill in HZ):", f"  {words}"]
     contents: list[_Content] = [*source.recordings, *with_axis, *source.responses, *source.tables]
     content = contents[0]
+    if isinstance(content, NumberTable) and _is_uneven_record(content):
+        return ["it is neither a record nor a table of steady states: see the note on its times."]
     options = _options_of(content)
+    for key in _OF_READING if stated is not None else ():
+        if getattr(stated, key) != getattr(ImportMap(), key):
+            options[key] = getattr(stated, key)
     _take_amplitudes_of_names(options, files)
-    if len(source.recordings) + len(source.tables) + bool(source.responses) > 1:
+    several = len(source.recordings) + len(source.tables) + bool(source.responses) > 1
+    if several and "dataset" not in options:
         is_responses = isinstance(content, FrequencyResponses)
         options["dataset"] = "responses" if is_responses else content.name or "record"
     open_words = list(dict.fromkeys(_TO_FILL_IN.findall(" ".join(options.words()))))
@@ -105,6 +119,12 @@ def _may_have_axis(table: NumberTable) -> bool:
         not np.iscomplexobj(column) and table.role(name) not in ("mark", "coherence")
         for name, column in table.columns.items()
     )
+
+
+def _is_uneven_record(table: NumberTable) -> bool:
+    """Whether a table has a time, motions and forces only: no column may be the frequency."""
+    roles = {table.role(name) for name in table.columns}
+    return "time" in roles and roles <= {"time", "force", "drive", *DERIVATIVE}
 
 
 def _take_amplitudes_of_names(options: _Options, files: Sequence[LaboratoryFile]) -> None:

@@ -180,8 +180,10 @@ def role_of(name: str, unit: str = "") -> str:
     """
     label = label_of(name)
     by_name = _role_by_name(label.word)
+    stated = unit or label.unit
+    if by_name == "level" and level_reference(stated) is not None:
+        by_name = "amplitude"  # a level in dB numbers no levels of a test
     try:
-        stated = unit or label.unit
         meaning = unit_meaning(level_reference(stated) or stated)
     except ValueError:
         return by_name

@@ -77,6 +77,12 @@ NOT_SEPARATED_TEXT = tuple(suffix for suffix in SUFFIXES if suffix not in _READE
 
 _HEAD = 4096
 _MOST_REASONS = 6  # notes listed where nothing was read
+_FORMATS = (
+    "Formats read: UFF, MATLAB, Octave's text, HDF5, netCDF 4, TDMS, LabVIEW measurement files, "
+    "CSV and other separated text."
+)
+_NUMPY = "it is a NumPy file: save its arrays as MATLAB, `scipy.io.savemat`, or as CSV"
+_EXCEL = "it is an Excel workbook: save its sheet as CSV"
 
 
 def read_laboratory_file(
@@ -118,12 +124,18 @@ def _kind(path: FilePath) -> str:
     for kind, form in _READERS.items():
         if form.recognised(head, suffix):
             return kind
-    raise InputError(f"{name} is of no known format ({_description(head)}).")
+    raise InputError(f"{name} is of no known format ({_description(head)}). {_FORMATS}")
 
 
 def _description(head: bytes) -> str:
     """Description of a file of unknown format."""
+    if head.startswith(b"PK"):
+        for entry, meaning in ((b".npy", _NUMPY), (b"[Content_Types]", _EXCEL), (b"xl/", _EXCEL)):
+            if entry in head:
+                return meaning
     for start, meaning in (
+        (b"\x93NUMPY", _NUMPY),
+        (b"\xd0\xcf\x11\xe0", _EXCEL),
         (b"PK", "it is a zip archive: unpack it first"),
         (b"\x1f\x8b", "it is a gzip archive: unpack it first"),
         (b"7z\xbc\xaf", "it is a 7z archive: unpack it first"),

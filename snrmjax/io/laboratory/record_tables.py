@@ -9,7 +9,8 @@ from jaxtyping import Float
 from snrmjax.io.files import FilePath
 from snrmjax.io.laboratory.names import column_unit
 from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference
-from snrmjax.io.laboratory.printed_times import rate_of_printed_times
+from snrmjax.io.laboratory.printed_times import PrintedRate, rate_of_printed_times
+from snrmjax.io.laboratory.uneven_times import odd_step, resampled
 from snrmjax.io.rows import header_of, read_cells
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
@@ -43,8 +44,9 @@ def read_record_table(path: FilePath) -> TimeRecording:
     after the sensor's name and a point: `tip.velocity_m_s`. Other columns are left out with a
     note.
     Returns a `TimeRecording` whose channels have the names of the columns and the sensor as their
-    `point`. Raises `ValueError` as `read_cells` does, for times not evenly increasing, for two
-    motions of one sensor or none at all, and for fewer than 16 samples.
+    `point`; at few odd steps of the time it is resampled, with a note. Raises `ValueError` as
+    `read_cells` does, for other uneven times, for two motions of one sensor or none at all, and
+    for fewer than 16 samples.
     """
     cells = read_cells(path)
     file = cells.file
@@ -57,9 +59,22 @@ def read_record_table(path: FilePath) -> TimeRecording:
             f"a time record needs {_FEWEST} samples at least, but {file} has {len(time)}."
         )
     start = float(time[0])
-    rate, further = _sampling_rate(time, file)
-    notes += further
-    return time_recording(values, channels, rate, start_time=start, name=file, notes=notes)
+    printed = _sampling_rate(time)
+    if printed is None:
+        even = resampled(time, values, "`time_s`")
+        if even is None:
+            odd = odd_step(time, "time_s")
+            raise InputError(
+                f"`time_s` must rise in even steps, but to row {odd['sample'] + 1} of {file} it "
+                f"steps by {odd['step']:.6g} s, usually by {odd['usual']:.6g} s: cut or resample "
+                "the record there."
+            )
+        rate, values, further = even.rate, even.values, [even.note]
+    else:
+        rate, further = printed.rate, [] if printed.note is None else [printed.note]
+    return time_recording(
+        values, channels, rate, start_time=start, name=file, notes=[*notes, *further]
+    )
 
 
 def with_named_channels(recording: TimeRecording) -> TimeRecording:
@@ -115,29 +130,16 @@ def _channels(names: list[str], file: str) -> tuple[list[Channel], list[Fact]]:
     return channels, [Fact("column_not_used", name=name, file=file, near="") for name in others]
 
 
-def _sampling_rate(time: Float[np.ndarray, " row"], file: str) -> tuple[float, list[Fact]]:
-    """The sampling rate (Hz) of times that are even within their printed digits, and notes."""
+def _sampling_rate(time: Float[np.ndarray, " row"]) -> PrintedRate | None:
+    """The sampling rate (Hz) of times that are even within their printed digits, or None."""
     steps = np.diff(time)
     step = float(time[-1] - time[0]) / len(steps)
     deviation = np.abs(time - time[0] - step * np.arange(len(time)))
     typical = float(np.median(steps))
     allowed = max(_EVEN * typical, 1.01 * _last_digit(time, typical))
-    worst = int(np.argmax(deviation))
-    if deviation[worst] <= allowed and step > 0:
-        return 1 / step, []
-    if (printed := rate_of_printed_times(time)) is not None:
-        return printed.rate, [] if printed.note is None else [printed.note]
-    falls = np.flatnonzero(steps <= 0)
-    if falls.size:
-        raise InputError(
-            f"`time_s` must rise, but row {falls[0] + 3} of {file} has {time[falls[0] + 1]:.9g} "
-            f"after {time[falls[0]]:.9g}."
-        )
-    gap = int(np.argmax(np.abs(steps - typical)))
-    raise InputError(
-        f"`time_s` must be evenly spaced, but in row {gap + 3} of {file} it steps by "
-        f"{steps[gap]:.6g} s, elsewhere by {typical:.6g} s: resample the record."
-    )
+    if deviation.max() <= allowed and step > 0:
+        return PrintedRate(1 / step)
+    return rate_of_printed_times(time)
 
 
 def _last_digit(time: Float[np.ndarray, " row"], step: float) -> float:

@@ -90,6 +90,24 @@ def note_on_shift(shared: SharedAxis) -> tuple[Fact, ...]:
     return (shifted, *cut)
 
 
+def note_on_clocks(clocks: Sequence[SharedAxis]) -> tuple[Fact, ...]:
+    """A note on channels that are separate records, and how they differ from the first ones."""
+    if len(clocks) < 2:
+        return ()
+    first, *others = clocks
+    return tuple(
+        Fact(
+            "clocks_apart",
+            names=other.channels,
+            of=first.channels,
+            seconds=other.axis.start - first.axis.start,
+            samples=(other.axis.start - first.axis.start) / first.axis.step,
+            rates=(1 / first.axis.step, 1 / other.axis.step),
+        )
+        for other in others
+    )
+
+
 class _JoinedSamples(AbstractSamples):
     """Samples of single-channel records of equal length."""
 

@@ -1,5 +1,6 @@
 """TDMS files (LabVIEW, NI): groups of channels with properties, read on demand."""
 
+import dataclasses
 import weakref
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -14,7 +15,13 @@ from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, in
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 from snrmjax.io.laboratory.physical_units import channel_meaning
-from snrmjax.io.laboratory.shared_clock import SharedAxis, TimeAxis, note_on_shift, shared_axes
+from snrmjax.io.laboratory.shared_clock import (
+    SharedAxis,
+    TimeAxis,
+    note_on_clocks,
+    note_on_shift,
+    shared_axes,
+)
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.time_recording import AbstractSamples, TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
@@ -93,9 +100,13 @@ def read_tdms(path: Path) -> LaboratoryFile:
                 waveforms[channel.name] = TimeAxis(step, start, len(channel))
             else:
                 separate[channel.name] = _numbers(path, name, channel)
-        for shared in shared_axes(waveforms):
-            recordings.append(_recording(path, name, channels, shared))
+        clocks = shared_axes(waveforms)
+        for shared in clocks:
+            record = _recording(path, name, channels, shared)
+            label = f"{name} {shared.channels[0]}" if len(clocks) > 1 else name
+            recordings.append(dataclasses.replace(record, name=label))
             notes += note_on_shift(shared)
+        notes += note_on_clocks(clocks)
         contents = read_struct(name, separate)
         recordings.extend(contents.recordings)
         tables.extend(table._replace(name=name) for table in contents.numbered())

@@ -96,6 +96,12 @@ def _read_from(
     for _ in range(ROUNDS):
         before = carrier
         local = local_fit(time, signal, carrier, at, sigma)
+        lost = np.flatnonzero(~np.isfinite(local.level))
+        if lost.size:
+            raise InputError(
+                f"the mode cannot be isolated: at {at[lost[0]]:.4g} s it is lost in noise or in "
+                "other motion: cut the record before."
+            )
         carrier, rate = Carrier(at, local.level), local.rate
     backwards = np.flatnonzero(rate.imag <= 0)
     if backwards.size:

@@ -20,6 +20,7 @@ _RANGE = 2.0  # largest ratio of a ridge's first frequency to the mode's, or its
 _REACH = 2.5  # largest ratio along a ridge, or its inverse
 _TRUST = 0.1  # 1σ of the log frequency of the model
 _ABOVE = 10.0  # times a frame's median power, which noise exceeds in fewer than 1 of 1000 bins
+_OCTAVES, _AROUND = 12, 2  # of a spectrum, and largest ratio of frequencies in a local median
 _BEGIN = 3  # least number of frames of a ridge
 _PATIENCE = 3  # frames in which a ridge may be missing
 
@@ -68,7 +69,7 @@ def spectral_peaks(
     bin_width = HERTZ / (n_fft * step)
     peaks = []
     for row in spectrum:
-        floor = np.sqrt(_ABOVE) * np.median(row)
+        floor = np.sqrt(_ABOVE) * _noise_level(row)
         at, _ = find_peaks(row, height=floor)
         at = at[(at > 0) & (at < len(row) - 1)]
         before, here, after = (np.log(row[at + k] + 1e-300) for k in (-1, 0, 1))
@@ -80,6 +81,16 @@ def spectral_peaks(
         table[0, k, : len(omega)], table[1, k, : len(omega)] = omega, amplitude
     middle = time[starts] + (length - 1) / 2 * step
     return SpectralPeaks(middle, table[0], table[1], 2 * HERTZ / (length * step))
+
+
+def _noise_level(row: Float[np.ndarray, " bin"]) -> Float[np.ndarray, " bin"]:
+    """Median of a spectrum over an octave to either side; at least that of all bins.
+
+    Noise of an integrated acceleration is far above the median of all bins at low frequencies.
+    """
+    centres = np.unique(np.geomspace(1, len(row) - 1, 2 * _OCTAVES).astype(int))
+    local = [np.median(row[k // _AROUND : k * _AROUND + 1]) for k in centres]
+    return np.maximum(np.interp(np.arange(len(row)), centres, local), np.median(row))
 
 
 def ridge_of_mode(peaks: SpectralPeaks, frequency: float) -> Ridge | None:

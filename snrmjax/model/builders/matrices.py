@@ -109,7 +109,11 @@ def from_matrices(
         rotation, n_free = coupled_first(np.stack(influence) @ rigid, np.abs(rigid).max(axis=0))
         free, rigid = np.split(rigid @ rotation, [n_free], axis=1)
         squared, shapes = np.pad(squared, (0, n_free)), np.concatenate([shapes, free], axis=1)
-    if not n_flexible or not np.any(load @ shapes):
+    if not n_flexible:
+        raise InputError(
+            "`stiffness` is zero for every motion: the mode of interest needs a linear stiffness."
+        )
+    if not np.any(load @ shapes):
         raise InputError(
             "the force excites no mode of the structure."
             if base is None

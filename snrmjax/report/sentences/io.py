@@ -83,7 +83,15 @@ SENTENCES: dict[str, Wording] = {
     "not_a_table": lambda name, sides: (
         f"{name} has {' by '.join(map(str, sides))} numbers and is not read as a table."
     ),
-    "uneven_time": "{name} is not an evenly sampled time and is read as a column.",
+    "uneven_time": (
+        "{name} is not evenly sampled and is read as a column: it has {n:#odd step} ({step:.6g} s "
+        "to sample {sample}, at {at:.9g} s; usually {usual:.6g} s). Cut or resample the record "
+        "there."
+    ),
+    "time_resampled": (
+        "{name} has {n:#odd step} ({step:.6g} s to sample {sample}, at {at:.9g} s; usually "
+        "{usual:.6g} s): resampled at {rate:.10g} Hz by cubic splines."
+    ),
     "time_seen_in_places": "{name} was checked at three positions: even steps.",
     "responses_along_first_side": "responses along the first axis that is not frequency.",
     "columns_numbered": "no header row above the numbers: the columns are numbered.",
@@ -119,9 +127,22 @@ SENTENCES: dict[str, Wording] = {
         )
         + " earlier: only the time common to all channels is read."
     ),
+    "clocks_apart": lambda names, of, seconds, samples, rates: (
+        f"{', '.join(names)} and {', '.join(of)} are separate records, between which phases are "
+        + (
+            f"not known: they are sampled at {rates[1]:.10g} and {rates[0]:.10g} Hz."
+            if rates[0] != rates[1]
+            else f"not read: by the file's start times they begin {1e3 * seconds:.6g} ms apart, "
+            + (
+                f"{samples:.4g} samples. Only whole samples are shifted."
+                if abs(samples - round(samples)) > 0.01
+                else "and share less than half of their time."
+            )
+        )
+    ),
     "channels_cut": lambda names, n: (
         f"{', '.join(names)} {'has' if len(names) == 1 else 'have'} more samples than the {n} "
-        "common to all channels: left out."
+        "common to all channels: those beyond are left out."
     ),
     "channels_of_files": lambda files: f"one record of the channels of {', '.join(files)}.",
     "runs_side_by_side": lambda labels, n: (
@@ -131,10 +152,13 @@ SENTENCES: dict[str, Wording] = {
     "rate_stated_above": "the sampling rate is stated above the numbers: {text}.",
     "text_read": "separator {separator}, decimal {decimal}, numbers from row {first_row}.",
     "coherence_alone": "a coherence without its frequency response is not read.",
+    "abscissa_converted": "the abscissa is in {stated}: converted to {unit}.",
+    "responses_over": (
+        "the abscissa of the responses is {what}, no frequency: they are read as a table."
+    ),
     "frequencies_do_not_rise": (
         "frequency responses whose frequencies do not increase are read as a table."
     ),
-    "uneven_record": "a time record with uneven steps is read as a table.",
     "channel_described": "channel {name}: {text}.",
     "model_named": "model {name}.",
     "whole_rate": "rate {rate} per unit, from a step of six digits, {step:.5e}.",

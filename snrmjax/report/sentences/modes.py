@@ -94,8 +94,12 @@ SENTENCES: dict[str, Wording] = {
     "decay_moves_with_amplitude": lambda frequency_hz, begin, from_hz, powers: (
         f"frequency and damping of the mode at {frequency_hz:.6g} Hz change with its amplitude "
         f"({from_hz:.5g} Hz {begin:.4g} s after the largest value): given are the small-amplitude "
-        "limits, from a fit of the decay from there on with rates that depend on "
-        f"{', '.join('A' if power == 1 else f'A^{power}' for power in powers)}"
+        "limits, from a fit of the decay from there on with "
+        + (
+            f"rates that depend on {', '.join(f'A^{power}'.removesuffix('^1') for power in powers)}"
+            if powers
+            else "constant rates"
+        )
     ),
     "coherence_in_part": "the coherence is incomplete and not used",
     "coherence_is_one": "the coherence is 1 at most lines: it contains no information on errors",

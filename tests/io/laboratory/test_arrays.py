@@ -602,3 +602,32 @@ def test_a_text_longer_than_its_file_is_refused(tmp_path, chunks):
         ValueError, match=rf"long\.h5 is damaged .*names has a string of {2**26} cha"
     ):
         read_laboratory_file(path)
+
+
+@pytest.mark.parametrize("rows", [(-1, 1), (1, -1)])
+def test_a_force_stated_by_one_number_holds_for_all_rows(tmp_path, rows):
+    path = tmp_path / "a.mat"
+    velocity = (HERTZ + 1j).reshape(rows)
+    scipy.io.savemat(path, {"freq": HERTZ.reshape(rows), "v": velocity, "F": 0.4, "fs": 5120.0})
+    (table,) = read_laboratory_file(path).tables
+    assert set(table.columns) == {"freq", "v", "F"}
+    np.testing.assert_array_equal(table.columns["F"], np.full(len(HERTZ), 0.4))
+
+
+def test_one_force_a_column_makes_levels_of_a_complex_matrix(tmp_path):
+    path = tmp_path / "a.mat"
+    velocity = np.column_stack([HERTZ + 1j, 2 * HERTZ + 3j])
+    scipy.io.savemat(path, {"freq": HERTZ, "v": velocity, "F": [[0.4, 0.8]]})
+    contents = read_laboratory_file(path)
+    (table,) = contents.tables
+    assert not contents.responses
+    np.testing.assert_array_equal(table.columns["v"], velocity.T.ravel())
+    np.testing.assert_array_equal(table.columns["F"], np.repeat([0.4, 0.8], len(HERTZ)))
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
+def test_a_numpy_file_is_refused_with_the_formats_that_are_read(tmp_path, name):
+    path = tmp_path / name
+    (np.save if name == "a.npy" else np.savez)(path, np.arange(9.0))
+    with pytest.raises(ValueError, match=r"NumPy file: .*savemat.* UFF, MATLAB, .* text\.$"):
+        read_laboratory_file(path)

@@ -150,3 +150,19 @@ def test_sibling_structs_are_one_record_or_one_table(tmp_path):
     (table,) = read_laboratory_file(tmp_path / "c.mat").tables
     assert table.columns["entry"].tolist() == [1.0] * 4 + [2.0] * 4
     np.testing.assert_array_equal(table.columns["v"], np.concatenate([F, 2 * F]))
+
+
+@pytest.mark.parametrize(
+    ("microseconds", "why"), [(30, "Only whole samples"), (7_200_000_000, "less than half")]
+)
+def test_channels_that_no_whole_shift_aligns_are_separate_records(tmp_path, microseconds, why):
+    path, start = tmp_path / "a.tdms", np.datetime64("2026-01-05T10:00:00.000000")
+    with TdmsWriter(path) as writer:
+        for name, late in (("Force", 0), ("Acc", microseconds)):
+            wave = {"wf_increment": 1e-3, "wf_start_time": start + np.timedelta64(late, "us")}
+            writer.write_segment([ChannelObject("g", name, np.arange(300.0), wave)])
+    contents = read_laboratory_file(path)
+    assert [record.name for record in contents.recordings] == ["g Force", "g Acc"]
+    (note,) = (note for note in contents.notes if note.kind == "clocks_apart")
+    assert why in str(note)
+    assert note["samples"] == pytest.approx(microseconds / 1e3, abs=1.1e-3)  # stored to 1 µs

@@ -305,3 +305,14 @@ def test_uneven_times_of_few_digits_stay_a_column_and_an_open_rate_is_stated(tmp
     gap = [f"{float(row.split(',')[0]) + 0.01 * (k > 150):.3f},1" for k, row in enumerate(rows)]
     path.write_text("\n".join(["t [s],v [m/s]", *gap]))
     assert "uneven_time" in [note.kind for note in read_laboratory_file(path).notes]
+
+
+def test_a_proposed_command_repeats_the_stated_format(tmp_path):
+    """The mark is ambiguous without --decimal: the proposal states it and asks for nothing."""
+    path = tmp_path / "a.csv"
+    rows = [f"{f};5;{v};40" for f, v in (("998", "990"), ("1.000", "1.046"), ("1.001", "1.201"))]
+    path.write_text("\n".join(["f [Hz];F [N];v [mm/s];phase [deg]", *rows]))
+    code, output = run_import(path, "--decimal", "comma")
+    assert code == 0
+    assert "--decimal comma" in output
+    assert "it will ask" not in output

@@ -1,5 +1,6 @@
 """Universal files: written by hand from the specification, by pyuff, and by ourselves."""
 
+import shlex
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ from truths.import_runs import run_import
 from truths.uff_writing import write_uff
 
 from snrmjax.io.laboratory import read_laboratory_file
+from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 from snrmjax.measure.recordings.time_recording import time_recording
@@ -221,3 +223,57 @@ def test_damaged_files_are_refused(tmp_path, change, complaint):
     path.write_text(change(HAND))
     with pytest.raises(ValueError, match=complaint):
         read_laboratory_file(path)
+
+
+ABSCISSA = "        18    0    0    0                 NONE                 NONE"
+
+
+@pytest.mark.parametrize(
+    ("label", "factor"), [("kHz", 1e3), ("rad/s", 0.5 / np.pi), ("rpm", 1 / 60), ("Hz", 1.0)]
+)
+def test_the_unit_of_the_abscissa_is_obeyed(tmp_path, label, factor):
+    path = tmp_path / "a.uff"
+    path.write_text(HAND.replace(ABSCISSA, ABSCISSA[:-20] + f"{label:>20}"))
+    contents = read_laboratory_file(path)
+    (responses,) = contents.responses
+    hertz = factor * np.array([79.0, 79.5, 80.0])
+    np.testing.assert_allclose(responses.frequency, 2 * np.pi * hertz, rtol=1e-12)
+    notes = [note.kind for note in contents.notes]
+    assert ("abscissa_converted" in notes) == (label != "Hz")
+
+
+@pytest.mark.parametrize(("kind", "what"), [(19, "a rotation speed"), (20, "an order")])
+def test_responses_over_another_abscissa_are_a_table(tmp_path, kind, what):
+    path = tmp_path / "a.uff"
+    path.write_text(HAND.replace(ABSCISSA, ABSCISSA.replace("18", str(kind))))
+    contents = read_laboratory_file(path)
+    assert not contents.responses
+    assert "frequency" not in contents.tables[0].columns
+    assert any(what in str(note) for note in contents.notes)
+
+
+def test_responses_of_falling_frequencies_are_responses(tmp_path):
+    path = tmp_path / "a.uff"
+    path.write_text(HAND.replace("  7.90000E+01  5.00000E-01", "  8.00000E+01 -5.00000E-01"))
+    rising, falling = tmp_path / "b.uff", read_laboratory_file(path).responses[0]
+    rising.write_text(HAND)
+    expected = read_laboratory_file(rising).responses[0]
+    np.testing.assert_array_equal(falling.frequency, expected.frequency)
+    np.testing.assert_array_equal(falling.values, expected.values[..., ::-1])
+
+
+def test_a_table_of_responses_is_imported_per_newton(tmp_path):
+    """Doubled frequencies make a table: its numbers are per newton, as those of responses."""
+    path, out = tmp_path / "a.uff", tmp_path / "out"
+    path.write_text(HAND.replace("  7.90000E+01  5.00000E-01", "  7.90000E+01  0.00000E+00"))
+    code, output = run_import(path)
+    assert code == 0
+    command = next(line for line in output.splitlines() if "snrmjax import" in line)
+    assert "--over-force" in command
+    words = shlex.split(command.replace("NEWTONS", "2"))[2:-2]
+    code, output = run_import(*words, "--out", out)
+    assert code == 0, output
+    velocity = np.asarray(read_steady_states(out / "measured.csv").velocity)[:, 0]
+    # Inches per second squared over pounds: 1 − 2j at 79 Hz, for 2 N.
+    acceleration = 2 * 0.0254 / 4.4482216152605 * (1 + 2j)
+    np.testing.assert_allclose(abs(velocity[0]), abs(acceleration) / (2 * np.pi * 79), rtol=1e-5)

@@ -5,10 +5,16 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from snrmjax.io.laboratory.arrays.value_tree import ArraySamples, ChannelPosition, Numbers
+from snrmjax.io.laboratory.arrays.value_tree import (
+    ArraySamples,
+    ChannelPosition,
+    Numbers,
+    in_memory,
+)
 from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference, unit_meaning
 from snrmjax.io.laboratory.printed_times import rate_of_printed_times
+from snrmjax.io.laboratory.uneven_times import odd_step, resampled
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
@@ -52,11 +58,12 @@ def recording_of(
     Arguments: `words` are lists of text of the struct: names of channels, and lists called
     unit, quantity, point and direction.
     """
-    axis = _time_axis(numbers)
-    if axis is None:
-        return StructRecord()
-    if isinstance(axis, Fact):
-        return StructRecord(notes=(axis,))
+    found: _Axis | Fact | str | None = _time_axis(numbers)
+    if isinstance(found, str):
+        found, numbers = _resampled(found, numbers)
+    if found is None or isinstance(found, Fact):
+        return StructRecord(notes=() if found is None else (found,))
+    axis = found
     sampled = {
         key: array
         for key, array in numbers.items()
@@ -135,8 +142,8 @@ def _channel(name: str, metadata: Mapping[str, str]) -> Channel:
     return Channel(name, quantity, unit, calibration, *point_and_direction)
 
 
-def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
-    """The sampling rate, as stated or from a time vector; a note where that is uneven."""
+def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | str | None:
+    """The sampling rate, as stated or from a time vector; its name where that is uneven."""
     single = {
         key: array for key, array in numbers.items() if array.size == 1 and not array.is_complex
     }
@@ -171,14 +178,49 @@ def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | Fact | None:
     return _even_axis(vectors[0], numbers[vectors[0]])
 
 
-def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
-    """Rate and start of a time vector, checked completely or, if long, at three positions."""
+def _resampled(
+    key: str, numbers: Mapping[str, Numbers]
+) -> tuple[_Axis | Fact | None, Mapping[str, Numbers]]:
+    """Arrays along a time with a few odd steps, resampled; a note for all other uneven times.
+
+    None for the times of a table of steady states.
+    """
+    n = numbers[key].length or 0
+    alike = {
+        name: array
+        for name, array in numbers.items()
+        if n in array.shape and len(array.dimensions) < 3 and not array.is_complex
+    }
+    time = alike.pop(key).vector(key).astype(float) * _unit_factor(key, numbers[key], "time")
+    if any(role_of(name) == "frequency" for name in alike):
+        return None, numbers
+    rows = [
+        np.moveaxis(array.all(name).astype(float), array.shape.index(n), -1).reshape(-1, n)
+        for name, array in alike.items()
+    ]
+    even = resampled(time, np.concatenate(rows), key) if rows else None
+    if even is None:
+        return odd_step(time, key), numbers
+    ends = np.cumsum([len(part) for part in rows])[:-1]
+    parts = np.split(even.values, ends)
+    changed = {
+        name: in_memory(part.T if len(part) > 1 else part[0], alike[name].attributes)
+        for name, part in zip(alike, parts, strict=True)
+    }
+    axis = _Axis(even.values.shape[1], even.rate, even.start, (key,), (even.note,))
+    return axis, {**numbers, **changed}
+
+
+def _even_axis(key: str, array: Numbers) -> _Axis | str:
+    """Rate and start of a time vector, checked completely or, if long, at three positions.
+
+    The name of the time where its steps are uneven.
+    """
     n = array.length or 0
     first, last = float(array.part(0, 1)[0]), float(array.part(n - 1, n)[0])
     step = (last - first) / (n - 1)
-    uneven = Fact("uneven_time", name=key)
     if not (np.isfinite(step) and step > 0 and np.isfinite(1 / step)):
-        return uneven
+        return key
     starts = sorted({0, max(0, n // 2 - _LOOK // 2), max(0, n - _LOOK)})
     parts = [np.arange(start, min(start + _LOOK, n)) for start in starts]
     at, where = np.unique(np.concatenate(parts), return_index=True)
@@ -196,7 +238,7 @@ def _even_axis(key: str, array: Numbers) -> _Axis | Fact:
     else:
         printed = rate_of_printed_times(time, at, unit) if np.isfinite(time).all() else None
         if printed is None:
-            return uneven
+            return key
         rate = printed.rate
         notes += [] if printed.note is None else [printed.note]
     return _Axis(n, rate, first * unit, (key,), tuple(notes))

@@ -31,6 +31,7 @@ _MOST_ENTRIES = 10_000
 _MOST_NAMED = 6
 _NUMBER = re.compile(r"[0-9]+([.,p_][0-9]+)*")
 _WIDEST = 64  # most columns of a matrix that become table columns
+_OF_ALL_ROWS = ("force", "drive")  # single numbers that hold for all rows of a table
 
 
 class Struct(NamedTuple):
@@ -197,11 +198,11 @@ def _read_numbers(
     contents.recordings.extend([] if record is None else [record])
     contents.notes.extend(notes)
     rest = {key: array for key, array in numbers.items() if key not in used}
-    rest = _responses(name, rest, contents, axis)
     levels = _by_level(rest)
     if levels is not None:
         contents.add("", _entries(name, levels))
         return
+    rest = _responses(name, rest, contents, axis)
     single = {key: array for key, array in rest.items() if array.size == 1}
     groups: dict[int, dict[str, Numbers]] = {}
     for key, array in rest.items():
@@ -213,7 +214,12 @@ def _read_numbers(
     if not groups and single and (entry or any(role_of(key) == "frequency" for key in single)):
         groups[1] = {}
     for n, group in groups.items():
-        repeated = single if entry or n == 1 else {}
+        is_table = any(role_of(key) == "frequency" for key in group)
+        repeated = {
+            key: array
+            for key, array in single.items()
+            if entry or n == 1 or (is_table and role_of(key) in _OF_ALL_ROWS)
+        }
         columns = {key: np.repeat(array.vector(key), n) for key, array in repeated.items()}
         columns |= {key: array.vector(key) for key, array in group.items()}
         units = _listed_units(group, words)
@@ -269,13 +275,23 @@ def _by_level(numbers: Mapping[str, Numbers]) -> list[Mapping[str, Node]] | None
     """Matrices of states by levels as one struct a level; None for other arrays.
 
     Condition: two matrices have one shape, and the frequency or a force is one of them or has one
-    value per column.
+    value per column; or a matrix has one row per frequency and one column per force.
     """
-    shapes = [
+    shapes: list[tuple[int, ...]] = [
         array.shape for array in numbers.values() if len(array.shape) == 2 and min(array.shape) > 1
     ]
-    shape = next((dimensions for dimensions in shapes if shapes.count(dimensions) > 1), None)
     names = {key: role_of(key) for key in numbers}
+    by_role = {
+        role: {array.length for key, array in numbers.items() if names[key] in roles}
+        for role, roles in (("frequency", ("frequency",)), ("load", ("force", "drive")))
+    }
+
+    def has_levels(shape: tuple[int, ...]) -> bool:
+        sides = shape, shape[::-1]
+        alone = any(a in by_role["frequency"] and b in by_role["load"] for a, b in sides)
+        return shapes.count(shape) > 1 or (alone and shape[0] != shape[1])
+
+    shape = next(filter(has_levels, shapes), None)
     frequency = [key for key in numbers if names[key] == "frequency"]
     if shape is None or max(shape) > _MOST_ENTRIES or not frequency:
         return None

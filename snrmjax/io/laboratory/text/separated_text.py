@@ -22,6 +22,7 @@ from snrmjax.io.laboratory.text.fields import (
     number_in,
     text_of,
 )
+from snrmjax.io.laboratory.text.row_units import columns_in_one_unit, without_units
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
 
@@ -34,7 +35,7 @@ _AXES = ("time", "frequency", "level", "rate", "step")
 def read_separated_text(path: Path, text_format: TextFormat | None = None) -> LaboratoryFile:
     """A table of text. Raises `ValueError` as `read_laboratory_file` does."""
     stated, file = text_format or TextFormat(), path.name
-    lines = text_of(path).splitlines()
+    lines, units_of_rows = without_units(text_of(path).splitlines())
     separator, decimal = _marks(lines, stated, file)
     first, width = _first_row(lines, separator, decimal, stated, file)
     header = _header(lines, first, width, separator, stated, file)
@@ -44,6 +45,9 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     if len(below) > len(rows):
         notes.append(Fact("comments_not_read", n=len(below) - len(rows)))
     columns = read_columns(rows, separator, stated, decimal, width, header.names, file, notes)
+    numbers = [k for k, _ in rows]
+    columns, known = columns_in_one_unit(columns, header.units, units_of_rows, numbers, file)
+    header = header._replace(units=known)
     runs = _runs_side_by_side(header, columns)
     if runs is not None:
         columns, units, labels = runs
@@ -218,10 +222,10 @@ def _header(
     rows = {
         k: (fields + [""] * width)[:width]
         for k in range(max(0, first - _INSPECTED_LINES), first)
-        if 0 < len(fields := fields_of(lines[k].lstrip("#%!/ "), separator)) <= width or k == at
+        if 0 < len(fields := _names_in(lines[k], separator, width)) <= width or k == at
     }
     if at >= 0:
-        count = len(fields_of(lines[at].lstrip("#%!/ "), separator)) if at < first else 0
+        count = len(_names_in(lines[at], separator, width)) if at < first else 0
         if count != width:
             raise InputError(
                 f"--header-row {at + 1} of {file} has {count} names, but the rows of numbers below "
@@ -260,6 +264,12 @@ def _header(
         unit = unit or unit_row[k].strip("[]() ")
         units |= {word: unit} if unit else {}
     return _Header(tuple(plain), tuple(names), units, tuple(labels), True)
+
+
+def _names_in(line: str, separator: str, width: int) -> list[str]:
+    """The fields of a line above the numbers, without an empty one before the first name."""
+    fields = fields_of(line.lstrip("#%!/ "), separator)
+    return fields[1:] if len(fields) == width + 1 and not fields[0] else fields
 
 
 def _runs_side_by_side(

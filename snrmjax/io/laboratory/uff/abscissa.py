@@ -1,4 +1,4 @@
-"""Abscissae of a universal file, from step and start with six digits."""
+"""Abscissae of a universal file in s or Hz, from step and start with six digits."""
 
 import math
 from collections.abc import Mapping
@@ -7,8 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.io.laboratory.physical_units import unit_meaning
+from snrmjax.io.laboratory.uff.data_sets import stated
+from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
 
+_SI = {"time": 1.0, "frequency": HERTZ}  # s and Hz
+_OTHERS = {19: "a rotation speed", 20: "an order"}  # specific data types
 _EVEN = 1e-6  # of a step: tolerance of an even abscissa in double precision
 _DIGITS = 5  # after the first, in the header's E13.5
 
@@ -19,6 +24,31 @@ class EvenAbscissa(NamedTuple):
     first: float
     rate: float
     notes: tuple[Fact, ...] = ()
+
+
+def in_si(function: Mapping[str, Any], notes: list[Fact]) -> Mapping[str, Any]:
+    """A function with its abscissa in s or Hz, as its unit label states (ms, kHz, rad/s, rpm)."""
+    label = stated(function.get("abscissa_axis_units_lab", ""))
+    try:
+        meaning = unit_meaning(label)
+    except ValueError:
+        return function
+    factor = meaning.factor / _SI.get(meaning.dimension, meaning.factor)
+    if abs(factor - 1) < 1e-12:
+        return function
+    unit = "Hz" if meaning.dimension == "frequency" else "s"
+    notes.append(Fact("abscissa_converted", stated=label, unit=unit))
+    numbers = {
+        key: function[key] * factor
+        for key in ("x", "abscissa_min", "abscissa_inc")
+        if key in function
+    }
+    return {**function, **numbers, "abscissa_axis_units_lab": unit}
+
+
+def other_abscissa(function: Mapping[str, Any]) -> str:
+    """What the abscissa of a frequency response is, if no frequency; else empty."""
+    return _OTHERS.get(function.get("abscissa_spec_data_type", 0), "")
 
 
 def even_abscissa(function: Mapping[str, Any]) -> EvenAbscissa | None:

@@ -7,9 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
-from snrmjax.io.laboratory.uff.abscissa import abscissa, even_abscissa
+from snrmjax.io.laboratory.physical_units import is_per_force
+from snrmjax.io.laboratory.uff.abscissa import (
+    EvenAbscissa,
+    abscissa,
+    even_abscissa,
+    in_si,
+    other_abscissa,
+)
 from snrmjax.io.laboratory.uff.axis_units import UnitSystem, axis_unit, unit_system
 from snrmjax.io.laboratory.uff.data_sets import direction_of, read_data_sets, stated
+from snrmjax.io.laboratory.uneven_times import odd_step, resampled
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
@@ -51,8 +59,9 @@ def read_uff(path: Path) -> LaboratoryFile:
     """
     sets = read_data_sets(path)
     units = unit_system(sets.of_type(164))
-    measured = sets.of_type(58)
-    source = _Source(path.name, units, [*sets.notes, *(units.notes if measured else ())])
+    notes = [*sets.notes]
+    measured = [in_si(function, notes) for function in sets.of_type(58)]
+    source = _Source(path.name, units, [*notes, *(units.notes if measured else ())])
     recordings: list[TimeRecording] = []
     responses: list[FrequencyResponses] = []
     levels: list[float] = []
@@ -65,10 +74,14 @@ def read_uff(path: Path) -> LaboratoryFile:
             recordings.append(record)
     for group in _grouped(measured, *_RESPONSE, _COHERENCE):
         level = float(group[0]["z_axis_value"])
-        for part in _without_doubles(group):
+        for part in map(_rising, _without_doubles(group)):
             x = abscissa(part[0])
+            other = other_abscissa(part[0])
             if not any(function["func_type"] in _RESPONSE for function in part):
                 source.notes.append(Fact("coherence_alone"))
+            elif other:
+                source.notes.append(Fact("responses_over", what=other))
+                tables.append(_table(part, f"responses {len(tables) + 1}", source, "abscissa"))
             elif np.all(np.diff(x) > 0) and x[0] >= 0:
                 responses.append(_responses(part, x, source))
                 levels.append(level if level else np.nan)
@@ -130,14 +143,20 @@ def _unique(channels: Sequence[Channel]) -> list[Channel]:
 
 
 def _recording(group: Sequence[_Function], source: _Source) -> TimeRecording | None:
-    """A time record of functions on one time axis; None where it is uneven."""
-    even = even_abscissa(group[0])
-    if even is None:
-        source.notes.append(Fact("uneven_record"))
-        return None
-    channels = _unique([source.channel(function, "rsp", "ordinate") for function in group])
+    """A time record of functions on one time axis; None, with a note, where it is uneven."""
     if any(np.iscomplexobj(function["data"]) for function in group):
         raise InputError("a time record cannot have complex numbers.")
+    values = np.stack([function["data"] for function in group])
+    even = even_abscissa(group[0])
+    if even is None:
+        time = np.asarray(group[0]["x"], dtype=float)
+        found = resampled(time, values, "time")
+        if found is None:
+            source.notes.append(odd_step(time, "time"))
+            return None
+        source.notes.append(found.note)
+        values, even = found.values, EvenAbscissa(found.start, found.rate, (found.note,))
+    channels = _unique([source.channel(function, "rsp", "ordinate") for function in group])
     described = [stated(function["id1"]) for function in group]
     descriptions = [
         Fact("channel_described", name=channel.name, text=text)
@@ -145,13 +164,23 @@ def _recording(group: Sequence[_Function], source: _Source) -> TimeRecording | N
         if text
     ]
     return time_recording(
-        np.stack([function["data"] for function in group]),
+        values,
         channels,
         even.rate,
         start_time=even.first,
         name=described[0] if len(set(described)) == 1 else "",
         notes=[*even.notes, *descriptions][:_MOST_NOTES],
     )
+
+
+def _rising(part: list[_Function]) -> list[_Function]:
+    """Functions of a falling abscissa in the order of a rising one."""
+    if not np.all(np.diff(abscissa(part[0])) < 0):
+        return part
+    return [
+        {**function, "abscissa_spacing": 0} | {key: function[key][::-1] for key in ("x", "data")}
+        for function in part
+    ]
 
 
 def _without_doubles(group: Sequence[_Function]) -> list[list[_Function]]:
@@ -218,6 +247,13 @@ def _column(function: _Function, name: str) -> str:
     )
 
 
+def _in_one_unit(values: np.ndarray, channel: Channel) -> tuple[np.ndarray, str]:
+    """Values of a channel and their unit: SI where only the file's system of units states it."""
+    if channel.unit or channel.quantity == "unknown":
+        return values, channel.unit
+    return values * channel.calibration, channel.si_unit
+
+
 def _table(
     group: Sequence[_Function], name: str, source: _Source, first: str = "frequency"
 ) -> NumberTable:
@@ -230,12 +266,20 @@ def _table(
             for function, channel in zip(group, channels, strict=True)
         ]
     )
-    unit = stated(group[0].get("abscissa_axis_units_lab", "")) or ("s" if kind == "time" else "Hz")
-    columns, units = {kind: abscissa(group[0])}, {kind: unit}
+    known = {"time": "s", "frequency": "Hz"}.get(kind, "")
+    unit = stated(group[0].get("abscissa_axis_units_lab", "")) or known
+    columns, units = {kind: abscissa(group[0])}, {kind: unit} if unit else {}
     for function, channel in zip(group, named, strict=True):
         key = channel.name if channel.name not in columns else f"{channel.name} value"
-        columns[key] = function["data"]
-        units |= {key: channel.unit} if channel.unit else {}
+        columns[key], unit = _in_one_unit(function["data"], channel)
+        if function["func_type"] in _RESPONSE and unit and not is_per_force(unit):
+            reference = source.channel(function, "ref", "orddenom")
+            if reference.quantity == "force":
+                _, of_reference = _in_one_unit(columns[key], reference)
+                if not reference.unit:
+                    columns[key] = columns[key] / reference.calibration
+                unit = f"({unit})/{of_reference}"
+        units |= {key: unit} if unit else {}
     if level := group[0]["z_axis_value"]:
         columns["z_axis_value"] = np.full(len(group[0]["x"]), float(level))
     return NumberTable(name, columns, units)
