@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
 
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.curve_terms import CurveTerms
@@ -29,6 +31,8 @@ _SMALLEST_STD = 1e-4  # of a prior's scale: lower bound of a 1σ
 _FARTHEST = 5.0  # 1σ: bound of the variation of the roughness
 _MOST = 0.5  # upper bound of 1σ of level errors, relative or rad: more is another structure
 _LEAST = 4.0  # nats below the most likely grid point: points below are not expanded
+_BELOW, _ABOVE, _ON_A_GRID = 5.0, 3.0, 25  # nats about the mode of ln 1σ, and points between
+_TAIL = 0.025  # on each side of a 95 % interval
 ALONG = 14  # basis functions of a discrepancy, for each of the two parts
 
 
@@ -275,6 +279,36 @@ def averaged(
     return point, Gaussian(
         mean, within + (offset * weight[:, None]).T @ offset, effective, level_std
     )
+
+
+def widening_of_levels(
+    objective: Objective, point: Float[np.ndarray, " hyper"], bounds: list[tuple[float, float]]
+) -> Float[np.ndarray, " error"]:
+    """1σ of a normal level error with the same 95 % interval as an error of unknown 1σ, over the
+    most likely 1σ: few levels, or small errors, leave it uncertain. 1 for a stated 1σ.
+
+    The posterior of that 1σ is integrated with the other hyperparameters at their mode; with many
+    precise levels the error is distributed as Student's t.
+    """
+    factors = np.ones(len(point[LEVELS]))
+    for k in range(len(factors)):
+        low, high = bounds[LEVELS.start + k]
+        if not high > low:
+            continue
+        mode = point[LEVELS.start + k]
+        log_std = np.linspace(max(low, mode - _BELOW), min(high, mode + _ABOVE), _ON_A_GRID)
+        trials = np.repeat(point[None], len(log_std), axis=0)
+        trials[:, LEVELS.start + k] = log_std
+        log_p = np.array([objective(trial)[0] for trial in trials])
+        weight = np.exp(log_p - log_p.max())
+        weight, std = weight / weight.sum(), np.exp(log_std - mode)
+
+        def outside(bound: float, weight: np.ndarray = weight, std: np.ndarray = std) -> float:
+            return float(weight @ ndtr(-bound / std)) - _TAIL
+
+        reach = -ndtri(_TAIL)
+        factors[k] = brentq(outside, reach * std[0], reach * std[-1]) / reach
+    return factors
 
 
 def remainders(
