@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
@@ -31,7 +32,8 @@ _SMALLEST_STD = 1e-4  # of a prior's scale: lower bound of a 1σ
 _FARTHEST = 5.0  # 1σ: bound of the variation of the roughness
 _MOST = 0.5  # upper bound of 1σ of level errors, relative or rad: more is another structure
 _LEAST = 4.0  # nats below the most likely grid point: points below are not expanded
-_BELOW, _ABOVE, _ON_A_GRID = 5.0, 3.0, 25  # nats about the mode of ln 1σ, and points between
+_ON_A_GRID, _FINE = 12, 240  # points of ln 1σ between its bounds, and interpolated ones
+_ABOUT_MODE = np.linspace(-1.5, 2.5, 11)  # further points
 _TAIL = 0.025  # on each side of a 95 % interval
 ALONG = 14  # basis functions of a discrepancy, for each of the two parts
 
@@ -281,34 +283,35 @@ def averaged(
     )
 
 
-def widening_of_levels(
+def expected_level_std(
     objective: Objective, point: Float[np.ndarray, " hyper"], bounds: list[tuple[float, float]]
 ) -> Float[np.ndarray, " error"]:
-    """1σ of a normal level error with the same 95 % interval as an error of unknown 1σ, over the
-    most likely 1σ: few levels, or small errors, leave it uncertain. 1 for a stated 1σ.
+    """1σ of a normal level error with the same 95 % interval as an error of unknown 1σ.
 
-    The posterior of that 1σ is integrated with the other hyperparameters at their mode; with many
-    precise levels the error is distributed as Student's t.
+    The posterior of each unstated 1σ is integrated, with the other hyperparameters at their mode:
+    few levels leave it uncertain (as Student's t), and small errors its order of magnitude.
     """
-    factors = np.ones(len(point[LEVELS]))
-    for k in range(len(factors)):
+    std = np.exp(point[LEVELS])
+    for k in range(len(std)):
         low, high = bounds[LEVELS.start + k]
         if not high > low:
             continue
-        mode = point[LEVELS.start + k]
-        log_std = np.linspace(max(low, mode - _BELOW), min(high, mode + _ABOVE), _ON_A_GRID)
+        about = np.clip(point[LEVELS.start + k] + _ABOUT_MODE, low, high)
+        log_std = np.unique([*np.linspace(low, high, _ON_A_GRID), *about])
         trials = np.repeat(point[None], len(log_std), axis=0)
         trials[:, LEVELS.start + k] = log_std
         log_p = np.array([objective(trial)[0] for trial in trials])
-        weight = np.exp(log_p - log_p.max())
-        weight, std = weight / weight.sum(), np.exp(log_std - mode)
+        # Cubic between points, without overshooting: few of them then do.
+        fine = np.linspace(low, high, _FINE)
+        weight, each = np.exp(PchipInterpolator(log_std, log_p - log_p.max())(fine)), np.exp(fine)
+        weight = weight / weight.sum()
 
-        def outside(bound: float, weight: np.ndarray = weight, std: np.ndarray = std) -> float:
+        def outside(bound: float, weight: np.ndarray = weight, std: np.ndarray = each) -> float:
             return float(weight @ ndtr(-bound / std)) - _TAIL
 
         reach = -ndtri(_TAIL)
-        factors[k] = brentq(outside, reach * std[0], reach * std[-1]) / reach
-    return factors
+        std[k] = brentq(outside, reach * each[0], reach * each[-1], xtol=1e-12) / reach
+    return std
 
 
 def remainders(

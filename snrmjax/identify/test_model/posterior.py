@@ -43,13 +43,13 @@ from snrmjax.identify.test_model.hyper import (
     averaged,
     bounds_of,
     differing_levels,
+    expected_level_std,
     hyper_at,
     layout_of,
     objective_of,
     prior_variances,
     remainders,
     roughness_grid,
-    widening_of_levels,
 )
 from snrmjax.identify.test_model.linear_gaussian import laplace_evidence
 from snrmjax.identify.test_model.state_noise import StateNoise, noise_of_states
@@ -277,6 +277,7 @@ def fit_test(
 
     variances = prior_variances(terms, layout, states)
     objective = objective_of(best.equations, states, terms, layout)
+    bounds = bounds_of(states, terms, best.point)
 
     def gaussian(point: np.ndarray) -> Gaussian:
         noise, variance = np.exp(point[NOISE]), variances(point)
@@ -284,13 +285,10 @@ def fit_test(
         known = variance > 0
         informed = np.zeros_like(variance)  # per unknown, after what curves absorb
         informed[known] = 1 - np.diag(covariance)[known] / variance[known]
-        for errors_of_kind, factor in zip(layout.levels.T, widening, strict=True):
-            variance[errors_of_kind] *= factor**2
+        variance[layout.levels] = expected_level_std(objective, point, bounds) ** 2
         wide = exchanged.posterior(noise, variance)[1]
         return Gaussian(mean, wide, float(np.sum(informed)), np.sqrt(variance[layout.levels[0]]))
 
-    bounds = bounds_of(states, terms, best.point)
-    widening = widening_of_levels(objective, best.point, bounds)
     point, summary = best.point, gaussian(best.point)
     if average_roughness:
         grid = roughness_grid(objective, best.point, bounds)

@@ -10,7 +10,7 @@ from truths.exact_states import CONSTANT, damping, squared
 
 from snrmjax.identify.test_model import states as measured
 from snrmjax.identify.test_model.gauss_newton import Rounds
-from snrmjax.identify.test_model.hyper import widening_of_levels
+from snrmjax.identify.test_model.hyper import expected_level_std
 from snrmjax.identify.test_model.posterior import fit_test, levels_in_order
 from snrmjax.numerics.blocks import on_one_core
 
@@ -229,32 +229,34 @@ def test_a_force_without_stated_error_gets_a_fraction_of_the_velocitys():
 @pytest.mark.parametrize("n_levels", [3, 5, 12])
 def test_an_unknown_std_of_levels_widens_their_errors_as_students_t_does(n_levels):
     """Known errors of n levels: with ln σ uniform, a further one is Student's t with n degrees."""
-    square, low = 1e-3, np.log(1e-6)
+    square = 1e-3
 
     def objective(point):
         log_std = point[3]
         return -n_levels * log_std - 0.5 * square * np.exp(-2 * log_std), np.zeros_like(point)
 
+    bounds = [(0.0, 0.0)] * 3 + [(np.log(1e-5), np.log(30.0))] + [(0.0, 0.0)] * 3
     point = np.zeros(7)
     point[3] = 0.5 * np.log(square / n_levels)
-    bounds = [(0.0, 0.0)] * 3 + [(low, 2.0)] + [(0.0, 0.0)] * 3
-    factors = widening_of_levels(objective, point, bounds)
-    # The grid resolves ln σ to a third.
-    assert factors[0] == pytest.approx(t.ppf(0.975, n_levels) / norm.ppf(0.975), rel=5e-3)
-    np.testing.assert_array_equal(factors[1:], 1.0)  # stated
+    std = expected_level_std(objective, point, bounds)
+    wanted = t.ppf(0.975, n_levels) / norm.ppf(0.975) * np.sqrt(square / n_levels)
+    # Points of ln σ are 0.4 apart.
+    assert std[0] == pytest.approx(wanted, rel=0.02)
+    np.testing.assert_array_equal(std[1:], 1.0)  # stated
 
 
 def test_level_errors_that_the_states_do_not_show_have_their_prior():
-    """Only the half-normal prior of σ: 95 % of draws of σ and of an error lie inside."""
+    """ln σ uniform below 0.1: 95 % of draws of σ and of an error lie inside."""
 
-    def objective(point):  # per ln σ
-        return point[4] - 0.5 * np.exp(2 * point[4]), np.zeros_like(point)
+    def objective(point):
+        return 0.0, np.zeros_like(point)
 
-    bounds = [(0.0, 0.0)] * 4 + [(-9.0, 4.0)] + [(0.0, 0.0)] * 2
-    factor = widening_of_levels(objective, np.zeros(7), bounds)[1]
-    std, error = np.random.default_rng(0).normal(size=(2, 200_000))
-    # 1σ of the fraction is 5e-4.
-    assert np.mean(np.abs(std * error) < 1.96 * factor) == pytest.approx(0.95, abs=2e-3)
+    bounds = [(0.0, 0.0)] * 4 + [(np.log(1e-5), np.log(0.1))] + [(0.0, 0.0)] * 2
+    std = expected_level_std(objective, np.zeros(7), bounds)[1]
+    rng = np.random.default_rng(0)
+    errors = np.exp(rng.uniform(np.log(1e-5), np.log(0.1), 200_000)) * rng.normal(size=200_000)
+    # 1σ of the fraction is 5e-4; the ends of the range count half a point more.
+    assert np.mean(np.abs(errors) < 1.96 * std) == pytest.approx(0.95, abs=2e-3)
 
 
 def test_states_with_correlated_residuals_count_as_fewer(known, found):
