@@ -9,7 +9,6 @@ equation 3; for periodic motions of such models, harmonic balance in discrete ti
 """
 
 import itertools
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
+
+from snrmjax.numerics.compiled import compiled
 
 _HARMONICS = 7
 _ANGLES = 64
@@ -89,7 +90,7 @@ class Resonances(NamedTuple):
     slopes: Float[Array, "2 amplitude coefficient"]  # of angle and force over the coefficients
 
 
-@partial(jax.jit, static_argnames=("exponents", "mode"))
+@compiled
 def model_resonances(
     model: StateSpace, amplitudes: Float[Array, " amplitude"], exponents: Exponents, mode: int
 ) -> Resonances:

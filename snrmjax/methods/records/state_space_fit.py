@@ -44,6 +44,7 @@ from snrmjax.methods.records.state_space_start import (
     regressed,
 )
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.rules import InputError
 
 _PER_CYCLE = 32.0  # samples of the model per cycle of the mode
@@ -251,12 +252,12 @@ def _mean_periods(
     )
 
 
-@partial(jax.jit, static_argnames="exponents")
+@compiled
 def _outputs(model: StateSpace, starts: Array, force: Array, exponents: Exponents) -> Array:
     return jax.vmap(lambda x, u: simulated_output(model, x, u, exponents))(starts, force)
 
 
-@partial(jax.jit, static_argnames="exponents")
+@compiled
 def _output_slopes(
     model: StateSpace, starts: Array, force: Array, exponents: Exponents
 ) -> tuple[Array, Array]:

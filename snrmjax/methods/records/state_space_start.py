@@ -19,6 +19,7 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.measure.recordings.multisine import MultisineResponses
 from snrmjax.methods.records.state_space import Exponents, StateSpace, hold, response
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
 from snrmjax.numerics.rules import InputError
 
@@ -164,7 +165,7 @@ def regressed(periods: Periods, natural: float, exponents: Exponents) -> Start |
     return Start(model, now)
 
 
-@jax.jit
+@compiled
 def _response_slopes(model: StateSpace, z: Array) -> tuple[Array, Array]:
     flat, rebuild = ravel_pytree(model)
 

@@ -10,7 +10,7 @@ from snrmjax.model.effect_base import AbstractHysteresis
 from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, on_one_core
-from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
@@ -66,7 +66,7 @@ def normal_mode_at_velocities(
     return _at_velocities(model, wanted, harmonic_order, steps)
 
 
-@jitted
+@compiled
 def _at_velocities(
     model: Structure, velocities: Float[Array, " velocity"], harmonic_order: int, steps: int
 ) -> PeriodicMotion:

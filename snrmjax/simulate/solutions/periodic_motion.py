@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
@@ -99,7 +99,7 @@ def periodic_motion(
     return motion_near(model, load, near, condition, target, iterations)
 
 
-@jitted
+@compiled
 def motion_near(
     model: Structure,
     force: Float[Array, ""],

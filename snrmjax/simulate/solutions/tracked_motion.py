@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.compiled import jitted, numbers_as_arrays
+from snrmjax.numerics.compiled import compiled, numbers_as_arrays
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.solutions.periodic_motion import (
     Condition,
@@ -130,7 +130,7 @@ class _Path(NamedTuple):
     known: Bool[Array, ""]
 
 
-@jitted
+@compiled
 def _continued(
     known: tuple, new: tuple, motion: PeriodicMotion, condition: Condition
 ) -> PeriodicMotion:

@@ -32,7 +32,7 @@ from snrmjax.model.effect_base import (
 from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.virtual_test.equipment import (
     Instruments,
@@ -234,7 +234,7 @@ def run_test(
     return record, end
 
 
-@eqx.filter_jit
+@compiled
 def _run(
     laboratory: Laboratory,
     friction: tuple[AbstractHysteresis, ...],
