@@ -1,12 +1,6 @@
-"""Units of the files, for numbers that are in rad/s and rad internally."""
+"""Numbers of files, in their units, from those in rad/s and rad."""
 
 import math
-
-HERTZ = 2.0 * math.pi
-"""One hertz in rad/s."""
-
-DEGREE = math.pi / 180.0
-"""One degree in rad."""
 
 
 def in_unit(value: float, unit: float) -> float:
@@ -19,6 +13,7 @@ def in_unit(value: float, unit: float) -> float:
     Arguments: `value` in rad/s or rad, `unit` likewise. Returns the number in that unit; read
     back, it is `value` to one rounding, and exactly so when `value` itself came from a file.
 
+    >>> from snrmjax.numerics.units import HERTZ
     >>> in_unit(79.02 * HERTZ, HERTZ)
     79.02
     """

@@ -1,11 +1,11 @@
 """Units of files in the internal units rad/s and rad, and units in print."""
 
-import numpy as np
+import math
 
-HERTZ = 2 * np.pi
+HERTZ = 2 * math.pi
 """One hertz in rad/s."""
 
-DEGREE = np.pi / 180
+DEGREE = math.pi / 180
 """One degree in rad."""
 
 

@@ -25,7 +25,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.rules import POSITIVE, InputError, Rule
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.study.computations.base import (
     FORCE,
     AbstractComputation,

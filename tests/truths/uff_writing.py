@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pyuff
 
-from snrmjax.io.units import HERTZ, in_unit
+from snrmjax.io.units import in_unit
+from snrmjax.numerics.units import HERTZ
 
 _TYPES = {
     "displacement": 8,

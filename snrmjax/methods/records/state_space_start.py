@@ -22,6 +22,7 @@ from snrmjax.methods.records.state_space import Exponents, StateSpace, hold, res
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 HIGHEST = 4.0
 """Times the mode's frequency: highest fitted line, beyond the third harmonic."""
@@ -133,9 +134,9 @@ def regressed(periods: Periods, natural: float, exponents: Exponents) -> Start |
     count = periods.force.shape[1]
     spectra = np.fft.rfft(periods.velocity, axis=1)
     line = np.arange(spectra.shape[1])
-    highest = HIGHEST * natural / (2 * np.pi * periods.rate) * count
+    highest = HIGHEST * natural / HERTZ / periods.rate * count
     spectra[:, (line == 0) | (line > highest)] = 0
-    angular_rate = np.where(line == 0, 1.0, 2 * np.pi * line / count * periods.rate / natural)
+    angular_rate = np.where(line == 0, 1.0, HERTZ * line / count * periods.rate / natural)
     signals = [
         np.fft.irfft(spectrum, count, axis=1)
         for spectrum in (spectra, spectra / (1j * angular_rate))

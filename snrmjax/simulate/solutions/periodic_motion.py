@@ -13,9 +13,10 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.newton import ROUNDING, Point, newton
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
-from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
+from snrmjax.simulate.balance.labelled import batch_variables
 from snrmjax.simulate.balance.not_found import nan_unless
 from snrmjax.simulate.continuation.event_equations import event_condition
 from snrmjax.simulate.continuation.events import height

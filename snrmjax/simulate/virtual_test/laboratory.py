@@ -34,6 +34,7 @@ from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.virtual_test.equipment import (
     Instruments,
     Shaker,
@@ -147,7 +148,7 @@ class Laboratory(eqx.Module):
             )
         if self.substeps < 1:
             raise InputError(f"`substeps` must be 1 or more, but is {self.substeps}.")
-        fastest = _fastest(self.structure, self.shaker) / (2 * np.pi)
+        fastest = _fastest(self.structure, self.shaker) / HERTZ
         if self.sampling_rate * self.substeps < _FEWEST_STEPS * fastest:
             raise InputError(
                 f"`sampling_rate` times `substeps` must be {_FEWEST_STEPS} times the highest "
@@ -170,7 +171,7 @@ class Laboratory(eqx.Module):
 
     def samples(self, cycles: float) -> int:
         """Number of samples in so many cycles of the mode of interest."""
-        return round(cycles * self.sampling_rate * 2 * np.pi / self.frequency)
+        return round(cycles * self.sampling_rate * HERTZ / self.frequency)
 
     def at_rest(self, controller: AbstractController) -> LabState:
         """The state of the structure at rest."""
