@@ -114,8 +114,9 @@ class Laboratory(eqx.Module):
     one newton per volt. The remaining images of the voltage alias into the force by about
     (ω period)⁴/38 of the shaker's own force, which near resonance may be several times the force
     on the structure.
-    Raises `ValueError` for impossible parameters, a rate too low, and effects of the measurement
-    or of the force's spectrum, which shaker and instruments produce here.
+    Raises `ValueError` for impossible parameters, a rate too low, a force at a node of the mode of
+    interest, and effects of the measurement or of the force's spectrum, which shaker and
+    instruments produce here.
     """
 
     structure: Structure
@@ -140,6 +141,9 @@ class Laboratory(eqx.Module):
             raise InputError(
                 "the virtual laboratory drives by a shaker, but an unbalance drives the model."
             )
+        modes = self.structure.modes
+        if not modes.driven()[modes.mode_of_interest]:
+            raise InputError("the shaker does not drive the mode of interest: move its force.")
         if self.structure.hysteretic and not self.largest_displacement > 0:
             kinds = ", ".join(effect.kind for effect in self.structure.hysteretic)
             raise InputError(
