@@ -32,7 +32,7 @@ def show_by(renderer: Renderer) -> None:
     _registered[:] = [renderer]
 
 
-def shown() -> Renderer:
+def renderer() -> Renderer:
     """The registered renderer."""
     if not _registered:
         raise InputError("nothing shows facts and results: `import snrmjax` registers what does.")
