@@ -70,8 +70,6 @@ import sys
 
 import lazy_loader
 
-from snrmjax.numerics.rendering import shown_by
-
 # Before any array is created: earlier ones would be float32. JAX reads the variable on import;
 # importing it here would take two thirds of the time of `snrmjax --help`.
 os.environ["JAX_ENABLE_X64"] = "1"
@@ -83,11 +81,7 @@ if "jax" in sys.modules:
 
     jax.config.update("jax_enable_x64", True)
 
-shown_by(
-    sentences="snrmjax.report.sentences",
-    printed="snrmjax.report.printed",
-    figures="snrmjax.report.plots",
-)
+import snrmjax.report  # noqa: F401  # registers how facts and results are shown
 
 __version__ = "0.1.0"
 

@@ -83,7 +83,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 @pytest.fixture(autouse=True, scope="session")
 def no_kept_programs():
     """Tests exchange functions of the package, of which programs that are kept know nothing."""
-    from snrmjax.numerics.kept_programs import keep_no_programs
+    from snrmjax.numerics.compiled import keep_no_programs
 
     keep_no_programs()
 

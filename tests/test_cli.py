@@ -24,8 +24,8 @@ import snrmjax as sj
 from snrmjax import cli
 from snrmjax.cli import app, main, simulate_commands
 from snrmjax.io import tables
-from snrmjax.io.units import HERTZ
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report.style import png_bytes
 from snrmjax.simulate.continuation import event_equations
 

@@ -90,9 +90,9 @@ SUB_ROOMS = {
     "diagnose.checks": {"diagnose.misfit", "diagnose.priors"},
     "diagnose.location": {"diagnose.misfit"},
     "io.calculix": {"io.files"},
-    "io.laboratory": {"io.files", "io.rows", "io.units"},
+    "io.laboratory": {"io.files", "io.rows"},
     "io.exchange": {
-        *("io.files", "io.units", "io.columns", "io.rows", "io.tables", "io.toml_table"),
+        *("io.files", "io.columns", "io.rows", "io.tables", "io.toml_table"),
         "io.laboratory",
     },
     "report.figures": {
@@ -110,7 +110,7 @@ SUB_ROOMS = {
         *("model.attachment", "model.potential", "model.structures"),
     },
     "io.reduction": {
-        *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
+        *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table"),
     },
     "diagnose.design": {"diagnose.misfit", "diagnose.fitted_effects", "diagnose.priors"},
     "condense.elements": {"condense.load_cases"},

@@ -18,8 +18,8 @@ def demo(out: Out) -> None:
     from snrmjax.io import results
     from snrmjax.io.models import write_model
     from snrmjax.io.tables import write_steady_states
-    from snrmjax.io.units import HERTZ
     from snrmjax.model.builders.beams import FLAT_BEAM_FORCES
+    from snrmjax.numerics.units import HERTZ
     from snrmjax.pipelines.identify import identify_test
     from snrmjax.report.figures.simulation import simulated_response_figure
     from snrmjax.report.pages import identified_test as page

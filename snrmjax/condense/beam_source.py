@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,6 +21,7 @@ from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import StaticSolver
 from snrmjax.condense.reduction import ASSUMED_DAMPING, ReductionSource, ShapeLines
 from snrmjax.model.modes import have_values
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
 
@@ -88,7 +88,7 @@ class _ModalData(NamedTuple):
     position: Float[Array, " node"]  # along the chord, m
 
 
-@eqx.filter_jit
+@compiled
 def _modal_data(
     beam: Beam,
     basis: ReductionBasis,

@@ -1,11 +1,14 @@
 """Static displacement of a reduced-order model under modal forces."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from snrmjax.model.potential import PolynomialPotential
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.newton import newton
 
 _STEPS, _ITERATIONS = 40, 6
 _TOLERANCE = 1e-9  # of the force
@@ -37,17 +40,17 @@ def static_displacement(
     def tangent(q: Array) -> Array:
         return jnp.diag(squared) + potential.stiffness(q)
 
+    def linearised(q: Array, f: Array) -> tuple[Array, Array]:
+        return balance(q, f), tangent(q)
+
     def from_rest(full: Array) -> Array:
         def step(carry: tuple[Array, Array], fraction: Array) -> tuple[tuple[Array, Array], None]:
             before, good = carry
-            q = predicted = before - jnp.linalg.solve(
-                tangent(before), balance(before, fraction * full)
-            )
-
-            def newton(_: int, q: Array) -> Array:
-                return q - jnp.linalg.solve(tangent(q), balance(q, fraction * full))
-
-            q = jax.lax.fori_loop(0, _ITERATIONS, newton, q)
+            load = fraction * full
+            predicted = before - jnp.linalg.solve(tangent(before), balance(before, load))
+            size = jnp.max(jnp.abs(load) / squared)
+            root = newton(partial(linearised, f=load), predicted, most=_ITERATIONS, scale=size)
+            q = root.one_more()[0]
             scaled = tangent(q) / jnp.sqrt(squared[:, None] * squared)
             moved, expected = (jnp.linalg.norm((x - before) * frequency) for x in (q, predicted))
             # A step much longer than the tangent prediction has jumped to another path.

@@ -66,7 +66,7 @@ from snrmjax.numerics.rules import InputError
 
 @on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
 @on_one_core
-@naming_wrong_phases
+@naming_wrong_phases(data="data", modes="model")
 def diagnose_model(
     model: Structure,
     data: SteadyStates,

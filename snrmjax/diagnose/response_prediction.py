@@ -18,12 +18,12 @@ from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
 
-_HERTZ = 2 * np.pi
 _MOST_LEVELS = 12  # to be simulated
 
 
@@ -175,7 +175,7 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseReso
         top = _largest(data, rows, sensor)
         if frequency[top] in (frequency[rows].min(), frequency[rows].max()):
             return _NOWHERE
-        return PhaseResonance(float(frequency[top]) / _HERTZ, float(abs(velocity[top])))
+        return PhaseResonance(float(frequency[top]) / HERTZ, float(abs(velocity[top])))
     if np.sum(rows) > 2 and np.max(np.abs(np.angle(velocity[rows]))) < ONE_PHASE:
         return _NOWHERE  # the phase was controlled: every state is a resonance
     rows = np.flatnonzero(rows & (velocity.real > 0))
@@ -185,10 +185,10 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseReso
         return _NOWHERE
     jump = jump_at_resonance(np.tan(phase), frequency)
     if jump is not None:
-        return _NOWHERE._replace(jump=(jump[0] / _HERTZ, jump[1] / _HERTZ))
+        return _NOWHERE._replace(jump=(jump[0] / HERTZ, jump[1] / HERTZ))
     at = np.interp(0.0, np.tan(phase), frequency)
     tip = np.interp(0.0, phase, speed / np.cos(phase))
-    return PhaseResonance(float(at) / _HERTZ, float(tip))
+    return PhaseResonance(float(at) / HERTZ, float(tip))
 
 
 def _largest(data: SteadyStates, rows: np.ndarray, sensor: int) -> int:
@@ -206,8 +206,8 @@ def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> PhaseRe
     folds, fold = curve.at_events("fold"), np.nan
     if folds.size:
         tips = np.abs(curve.velocity[folds, 1, sensor])
-        fold = float(curve.frequency[folds[np.argmax(tips)]]) / _HERTZ
-    return PhaseResonance(frequency / _HERTZ, speed, fold)
+        fold = float(curve.frequency[folds[np.argmax(tips)]]) / HERTZ
+    return PhaseResonance(frequency / HERTZ, speed, fold)
 
 
 def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:

@@ -17,6 +17,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 
 def caveat(
@@ -75,9 +76,7 @@ def _far(points: BackbonePoints, model: Structure) -> tuple[Fact, ...]:
     if not far.any():
         return ()
     names = tuple(np.array(["natural frequency", "damping"])[far].tolist())
-    lowest, mode = (
-        (w / (2 * np.pi), ratio) for w, ratio in (identified[0].tolist(), linear.tolist())
-    )
+    lowest, mode = ((w / HERTZ, ratio) for w, ratio in (identified[0].tolist(), linear.tolist()))
     return (Fact("far_from_linear_mode", quantities=names, lowest=lowest, linear=mode),)
 
 

@@ -24,6 +24,7 @@ from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import track_tone
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 _HIGHEST = 12  # harmonic of the force
 
@@ -75,7 +76,7 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[Fact]
 
 
 def _cycles(step: Step, rate: float) -> float:
-    return (step.stop - step.start) * step.frequency / (2 * np.pi * rate)
+    return (step.stop - step.start) * step.frequency / HERTZ / rate
 
 
 def _joined(steps: list[Step], rate: float) -> list[Step]:
@@ -142,7 +143,7 @@ def _middle(step: Step, fraction: float = 0.5) -> slice:
 
 def _demodulated(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndarray:
     """Phasors of neighbouring blocks of cycles, with phases relative to the record's time axis."""
-    cycle, n = 2 * np.pi * rate / frequency, rows.stop - rows.start
+    cycle, n = HERTZ * rate / frequency, rows.stop - rows.start
     blocks = max(1, min(int(n / cycle), 32))
     edges = np.round(np.arange(blocks + 1) * int(n / cycle / blocks) * cycle).astype(int)
     part = x[rows.start : rows.start + edges[-1]]
@@ -271,7 +272,7 @@ def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[F
         window = np.blackman(n)
         spectrum = np.abs(np.fft.rfft(part * window)) * 2 / window.sum()
         hertz = np.arange(len(spectrum)) * rate / n
-        f0 = one.frequency / (2 * np.pi)
+        f0 = one.frequency / HERTZ
         fundamental = float(_lines(x, rows, one.frequency, rate)[0])
         guard = 4.5 * rate / n
         away = np.abs(hertz - f0 * np.round(hertz / f0)) > guard

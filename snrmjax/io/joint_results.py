@@ -20,10 +20,10 @@ from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import load_named, write_values
 from snrmjax.io.tables import write_table
-from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 
 BAND_POINTS = 200
 _FORMAT = 6

@@ -10,10 +10,10 @@ from snrmjax.io.columns import PHASOR, harmonic_columns, read_header
 from snrmjax.io.files import FilePath, file_name, read_text, shown
 from snrmjax.io.rows import read_cells
 from snrmjax.io.tables import read_steady_states, write_table
-from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import DEGREE, HERTZ
 
 _DIGITS = 6  # of planned numbers
 

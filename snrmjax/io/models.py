@@ -18,7 +18,6 @@ from snrmjax.io.structure_matrices import (
     unbalance,
 )
 from snrmjax.io.toml_table import TomlTable, parsed_toml
-from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model import effects as known
 from snrmjax.model.builders.free_coordinates import coupled_first
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
@@ -41,6 +40,7 @@ from snrmjax.model.potential import (
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.names import near_miss, suggestion
 from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, InputError, Rule
+from snrmjax.numerics.units import DEGREE, HERTZ, in_unit
 
 _TOP_KEYS = (
     *("name", "mode_of_interest", "mode", "rigid_body_mode", "damping_coupling"),

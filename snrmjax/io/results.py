@@ -8,8 +8,8 @@ import numpy as np
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
-from snrmjax.io.units import HERTZ
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.balance.labelled import velocity_peaks
 from snrmjax.simulate.continuation.response_curve import (
     ResponseCurve,

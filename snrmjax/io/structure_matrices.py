@@ -16,7 +16,6 @@ from snrmjax.io.files import shown
 from snrmjax.io.laboratory.arrays.matlab_elements import checked_variables
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.io.toml_table import TomlTable
-from snrmjax.io.units import DEGREE
 from snrmjax.model.attachment import InfluenceVector, between, influence_vector
 from snrmjax.model.builders.matrices import check_names, from_matrices
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
@@ -24,6 +23,7 @@ from snrmjax.model.moving_base import MOTIONS, BaseMotion, base_motion
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE, InputError
+from snrmjax.numerics.units import DEGREE
 
 _MATRICES = ("mass", "stiffness", "damping")
 _SPARSE = ("data", "indices", "indptr", "row", "col", "offsets", "shape", "format")

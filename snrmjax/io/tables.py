@@ -24,7 +24,6 @@ from snrmjax.io.columns import (
 )
 from snrmjax.io.files import FilePath, file_name, read_text, shown, write_atomically
 from snrmjax.io.rows import Cells, cells_of
-from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.measure.base_excitation import as_recorded, base_excited_states
 from snrmjax.measure.states import (
     NO_PHASE,
@@ -39,6 +38,7 @@ from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import DEGREE, HERTZ, in_unit
 
 
 def read_steady_states(

@@ -1,6 +1,5 @@
 """Indicators of how close a measured steady state is to a (non)linear resonance."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +47,7 @@ def nnm_appropriation(
     return _appropriation(amplitudes, orders)
 
 
-@eqx.filter_jit
+@compiled
 def _appropriation(
     amplitudes: Complex[Array, "*batch sensor harmonic"], orders: tuple[int, ...]
 ) -> Float[Array, "*batch"]:

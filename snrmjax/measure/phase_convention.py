@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
@@ -207,28 +208,34 @@ class MisreadPhases(InputError):
         self.facts = facts
 
 
-def naming_wrong_phases(verb: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def naming_wrong_phases(
+    *, data: str, modes: str
+) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
     """Decorate an analysis to report wrong phases of its data first.
 
-    In the `notes` of its result, or by `MisreadPhases` in place of its `ValueError`.
+    In the `notes` of its result, or by `MisreadPhases` in place of its refusal.
+    Arguments: names of the analysis' parameters, with the states and with the modes or structure.
     """
 
-    @functools.wraps(verb)
-    def named(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        given: tuple[object, ...] = (*args, *kwargs.values())
-        data = [argument for argument in given if isinstance(argument, SteadyStates)]
-        modes = [argument for argument in given if isinstance(argument, LinearModes | Structure)]
-        wrong = wrong_phases(data[0], modes[0]) if data and modes else ()
-        try:
-            result: Any = verb(*args, **kwargs)
-        except MisreadPhases:  # raised by a nested analysis
-            raise
-        except InputError as error:
-            if wrong:
-                raise MisreadPhases(wrong, error) from error
-            raise
-        if wrong:
-            result = dataclasses.replace(result, notes=(*wrong, *result.notes))
-        return cast(Result, result)
+    def of(verb: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        signature = inspect.signature(verb)
 
-    return named
+        @functools.wraps(verb)
+        def named(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+            given = signature.bind(*args, **kwargs).arguments
+            wrong = wrong_phases(given[data], given[modes])
+            try:
+                result: Any = verb(*args, **kwargs)
+            except MisreadPhases:  # raised by a nested analysis
+                raise
+            except InputError as error:
+                if wrong:
+                    raise MisreadPhases(wrong, error) from error
+                raise
+            if wrong:
+                result = dataclasses.replace(result, notes=(*wrong, *result.notes))
+            return cast(Result, result)
+
+        return named
+
+    return of

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,7 +52,7 @@ def peak_amplitude(
     return _peak(checked_amplitudes("amplitudes", amplitudes, orders), orders)
 
 
-@eqx.filter_jit
+@compiled
 def _peak(
     values: Complex[Array, "*batch harmonic"], orders: tuple[int, ...]
 ) -> Float[Array, "*batch"]:

@@ -1,5 +1,6 @@
 """How an effect depends on amplitude, as declared or computed from its force alone."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import jax
@@ -68,6 +69,18 @@ def computed_shape(effect: type[AbstractForce]) -> Shape | None:
         part, order = Part.STIFFNESS, 2
     argument = _argument(unit, q, v)
     return Shape(part, symmetry, argument, power, strength_order=order)
+
+
+def conservative_effects(effects: Sequence[AbstractEffect]) -> tuple[AbstractEffect, ...]:
+    """Those effects that dissipate nothing: neither friction nor forces that depend on velocity."""
+
+    def is_elastic(effect: AbstractForce) -> bool:
+        with jax.ensure_compile_time_eval():
+            shape = shape_of(type(effect))
+        by_displacement = shape is not None and shape.argument is Argument.DISPLACEMENT
+        return isinstance(effect, AbstractMemoryless) and by_displacement
+
+    return tuple(e for e in effects if not isinstance(e, AbstractForce) or is_elastic(e))
 
 
 def _with_unit_strength(effect: type[AbstractForce]) -> AbstractForce:

@@ -54,7 +54,7 @@ from snrmjax.model.library.stiffness import (
     QuinticStiffness,
     StaticPreload,
 )
-from snrmjax.numerics.kept_programs import keep_no_programs
+from snrmjax.numerics.compiled import keep_no_programs
 from snrmjax.numerics.rules import InputError, require
 from snrmjax.numerics.units import unit_in_print
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.compiled import compiled
 
 Samples = Float[Array, " time"]
 
@@ -100,7 +100,7 @@ def _cubic(x: Float[Array, "4 crossing"]) -> tuple[Array, Array, Array, Array]:
     return first, linear, square, (after - before) / 6 + 0.5 * (first - second)
 
 
-@jitted  # traced once for the force, its Jacobian and each derivative of them
+@compiled  # traced once for the force, its Jacobian and each derivative of them
 def with_nonsmooth_points(
     force: Samples, displacement: Samples, nonsmooth_points: NonsmoothPoints
 ) -> Samples:

@@ -26,6 +26,7 @@ from snrmjax.model.elements import Elements, elements_of
 from snrmjax.model.modes import LinearModes, have_values
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.newton import newton
 from snrmjax.numerics.result import AbstractShown
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import unit_in_print
@@ -372,14 +373,14 @@ def _equilibria_by_newton(model: Structure, n_starts: int, seed: int) -> tuple[n
     radius = 10.0 ** rng.uniform(-2, 1, (n_starts, 1))
     direction = rng.normal(size=(n_starts, n))
     starts = np.concatenate([np.zeros((1, n)), radius * direction * scale])
-    ends, residual = (np.asarray(part) for part in _newton(model, starts))
+    ends, residual = (np.asarray(part) for part in _ends_of_newton(model, starts, np.max(scale)))
     good = np.all(np.isfinite(ends), axis=1) & (residual < 1e-9 * np.max(scale))
     return ends[good], 1e-6 * float(np.max(scale))
 
 
 @compiled
-def _newton(
-    model: Structure, starts: Float[Array, "start mode"]
+def _ends_of_newton(
+    model: Structure, starts: Float[Array, "start mode"], scale: Float[Array, ""]
 ) -> tuple[Float[Array, "start mode"], Float[Array, " start"]]:
     """Final iterates of Newton's method for ω²q + f(q, 0) = 0, and their residuals over ω²."""
     squared = model.linear_terms().stiffness
@@ -388,10 +389,13 @@ def _newton(
     def balance(q: Array) -> Array:
         return squared * q + model.memoryless_force(q[None], jnp.zeros((1, q.size)))[0]
 
-    def step(_: int, q: Array) -> Array:
-        return q - jnp.linalg.solve(_energy_and_tangent(model, q)[1], balance(q))
+    def linearised(q: Array) -> tuple[Array, Array]:
+        return balance(q), _energy_and_tangent(model, q)[1]
 
-    ends = jax.vmap(lambda q: jax.lax.fori_loop(0, 60, step, q))(starts)
+    def end(start: Array) -> Array:
+        return newton(linearised, start, most=60, scale=scale).one_more()[0]
+
+    ends = jax.vmap(end)(starts)
     return ends, jax.vmap(lambda q: jnp.max(jnp.abs(balance(q)) / springs))(ends)
 
 

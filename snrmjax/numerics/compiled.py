@@ -1,16 +1,26 @@
-"""Compilation of programs of many small operations, which run in sequence on a CPU."""
+"""The one door to compilation: `compiled`.
+
+A function of arrays that is called from Python is compiled by `@compiled`, whether it is public or
+not, differentiable or not; nothing else in the package calls `jax.jit`. Further tools build on it:
+
+- `blocks.by_blocks` and `by_member` call one program on rows or members of any number, `mapped`
+  inside a program runs one after the other what an accelerator runs as a batch;
+- `lanes.in_lanes` runs iterations of different lengths, whose programs make a few steps a call;
+- `io.programs` stores programs on disk for later processes, without being asked: it registers its
+  store here, and nothing else changes.
+
+Verbs that work on numbers, and call several programs, refuse traced arguments by `on_numbers`.
+"""
 
 import warnings
 from collections.abc import Callable
 from functools import cache, wraps
 from threading import Lock
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
-import equinox as eqx
 import jax
 import numpy as np
 
-from snrmjax.numerics.kept_programs import NotKept, ProgramKeeper, program_keeper
 from snrmjax.numerics.rules import InputError
 
 P = ParamSpec("P")
@@ -36,6 +46,31 @@ _OPTIONS: dict[str, str | bool | int] = {
     _EMITTERS: False,  # compiles a third faster, same run time
     _LEVEL: 1,  # compiles an eighth faster, same run time
 }
+
+
+class NotKept(Exception):
+    """A program depends on code outside this package and is not cached."""
+
+
+class ProgramKeeper(Protocol):
+    """A cache of compiled programs: looks them up, or has them compiled and stores them."""
+
+    def in_use(self) -> bool:
+        """Whether programs are cached under the current settings of JAX."""
+
+    def program(
+        self,
+        function: Callable[..., Any],
+        arguments: Any,
+        settings: tuple,
+        build: Callable[[], tuple[jax.stages.Lowered, Any]],
+    ) -> tuple[Callable[..., list[jax.Array]], Any]:
+        """The program of flat arrays for a function's arguments, and the structure of its results.
+
+        Arguments: `settings` of the compiler; `build` lowers the program, under a unique name,
+        if it is not in the cache.
+        Raises `NotKept` if no unique key can be made for it.
+        """
 
 
 def compiled(
@@ -119,6 +154,27 @@ def compiled(
     return call
 
 
+class _Registered:
+    keeper: ProgramKeeper | None = None
+    closed = False
+
+
+def keep_programs_with(keeper: ProgramKeeper) -> None:
+    """Cache programs from here on, unless code from outside is registered in the package."""
+    _Registered.keeper = None if _Registered.closed else keeper
+
+
+def keep_no_programs() -> None:
+    """Stop caching for good: code from outside is registered in the package."""
+    _Registered.closed, _Registered.keeper = True, None
+
+
+def program_keeper() -> ProgramKeeper | None:
+    """The cache of programs, if it is in use now."""
+    keeper = _Registered.keeper
+    return keeper if keeper is not None and keeper.in_use() else None
+
+
 def value_of(array: Any) -> np.ndarray | None:
     """An array's numbers on the host, also within a derivative; None within `jax.jit` or `vmap`."""
     if isinstance(array, jax.core.Tracer):
@@ -157,22 +213,9 @@ def as_numpy(array: Any) -> Any:
 def numbers_as_arrays(tree: T) -> T:
     """A tree whose Python floats and complex numbers are converted to NumPy's.
 
-    `compiled` and `eqx.filter_jit` trace those; Python's numbers they would treat as static.
+    `jax.jit` would give Python's a type of their own, and compile twice.
     """
     return jax.tree.map(_number, tree)
-
-
-def jitted(function: Callable[P, R]) -> Callable[P, R]:
-    """`eqx.filter_jit` of a function, with its floating-point numbers traced."""
-    inside = eqx.filter_jit(function)
-
-    @wraps(function)
-    def call(*arguments: P.args, **named: P.kwargs) -> R:
-        _in_double_precision()
-        traceable, settings = numbers_as_arrays((arguments, named))
-        return inside(*traceable, **settings)
-
-    return call
 
 
 def _in_double_precision() -> None:

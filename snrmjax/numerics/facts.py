@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from snrmjax.numerics import rendering
+from snrmjax.numerics.rendering import renderer
 
 
 class Fact(Mapping[str, Any]):
@@ -45,7 +45,7 @@ class Fact(Mapping[str, Any]):
 
     def __str__(self) -> str:
         """The fact as a sentence."""
-        return rendering.worded(self)
+        return renderer().sentence(self)
 
     def __repr__(self) -> str:
         """The fact as it is constructed in code."""

@@ -1,43 +1,39 @@
-"""Access to `report`, where sentences, printed results and figures are made on demand.
+"""How facts and results are shown: by `snrmjax.report`, which registers itself here.
 
-Packages below `report` never import it: they hold typed values. `import snrmjax` registers the
-modules that render them.
+Packages below `report` never import it: they hold typed values.
 """
 
-import importlib
-from typing import Any
+from typing import Any, Protocol
 
 from snrmjax.numerics.rules import InputError
 
-_modules: dict[str, str] = {}
+
+class Renderer(Protocol):
+    """Shows facts and results."""
+
+    def sentence(self, fact: Any) -> str:
+        """A `Fact` as a sentence."""
+
+    def screen(self, result: Any) -> str:
+        """A result as text for one screen."""
+
+    def html(self, result: Any) -> str:
+        """A result as HTML for notebooks."""
+
+    def figure(self, result: Any, **settings: Any) -> Any:
+        """The figure of a result."""
 
 
-def shown_by(*, sentences: str, printed: str, figures: str) -> None:
-    """Register the modules of sentences, printed results and figures; each is imported late."""
-    _modules.update(sentences=sentences, printed=printed, figures=figures)
+_registered: list[Renderer] = []
 
 
-def worded(fact: Any) -> str:
-    """A `Fact` as a sentence."""
-    return _module("sentences").sentence(fact)
+def show_by(renderer: Renderer) -> None:
+    """Show facts and results by this renderer from here on."""
+    _registered[:] = [renderer]
 
 
-def on_one_screen(result: Any) -> str:
-    """A result as text for one screen."""
-    return _module("printed").screen_of(result)
-
-
-def in_a_notebook(result: Any) -> str:
-    """A result as HTML for notebooks."""
-    return _module("printed").html_of(result)
-
-
-def drawn(result: Any, **settings: Any) -> Any:
-    """The figure of a result."""
-    return _module("figures").plot_result(result, **settings)
-
-
-def _module(what: str) -> Any:
-    if what not in _modules:
-        raise InputError(f"no {what} are registered: `import snrmjax` registers them.")
-    return importlib.import_module(_modules[what])
+def renderer() -> Renderer:
+    """The registered renderer."""
+    if not _registered:
+        raise InputError("nothing shows facts and results: `import snrmjax` registers what does.")
+    return _registered[0]

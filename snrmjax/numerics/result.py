@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from snrmjax.numerics import rendering
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rendering import renderer
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import DEGREE, HERTZ
@@ -103,10 +103,10 @@ class AbstractShown(eqx.Module):
 
     def __repr__(self) -> str:
         """The result on one screen; within `jax.jit` the fields' shapes."""
-        return rendering.on_one_screen(self) if self.has_screen() else eqx.tree_pformat(self)
+        return renderer().screen(self) if self.has_screen() else eqx.tree_pformat(self)
 
     def _repr_html_(self) -> str | None:
-        return rendering.in_a_notebook(self) if self.has_screen() else None
+        return renderer().html(self) if self.has_screen() else None
 
 
 @dataclass_transform(field_specifiers=(eqx.field, quantity, setting))
@@ -170,7 +170,7 @@ class AbstractResult(AbstractShown):
 
     def plot(self, **settings: Any) -> "matplotlib.figure.Figure":
         """The figure of this result; `settings` are those of its function in `sj.plot`."""
-        return rendering.drawn(self, **settings)
+        return renderer().figure(self, **settings)
 
 
 def _attribute(value: Any) -> str | float | int:

@@ -26,7 +26,6 @@ from snrmjax.io.exchange.record_import import ask_for_rate, at_stated_rate
 from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.io.tables import read_steady_states
-from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
@@ -34,6 +33,7 @@ from snrmjax.model.moving_base import SensorMotion, base_motion
 from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.pipelines.options import ModesOptions, checked, flag_of
 
 ModalFit = LinearModalFit | DecayModes

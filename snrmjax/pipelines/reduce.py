@@ -21,11 +21,11 @@ from snrmjax.io.calculix.reduction import read_deck_source
 from snrmjax.io.files import FilePath
 from snrmjax.io.reduction.beam_file import read_beam
 from snrmjax.io.reduction.load_tables import read_load_tables
-from snrmjax.io.units import HERTZ
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.pipelines.options import ReduceOptions, checked
 
 _SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # times the loads of single modes, for the model's range

@@ -8,11 +8,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from snrmjax.identify.pointwise.snrm import reference_sensor
-from snrmjax.io.units import HERTZ
 from snrmjax.model.parameters import checked_names, parameter_values
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.balance.harmonic_balance import resonant_modes
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.event_equations import FORCE, EventKind

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax.io.units import HERTZ
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report.figures import diagnosis as diagnosis_figures
 from snrmjax.report.figures import identification as figures
 from snrmjax.report.figures import joint_fit as joint_figures

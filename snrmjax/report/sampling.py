@@ -6,9 +6,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from snrmjax.identify.pointwise.prediction import PredictedResponse
-from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.simulate.continuation.response_curve import (
     MotionCurve,
     ResponseCurve,

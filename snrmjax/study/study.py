@@ -23,8 +23,9 @@ from snrmjax.model.parameters import (
 )
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.rules import POSITIVE, InputError, Rule
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.study.computations.base import (
     FORCE,
     AbstractComputation,
@@ -174,7 +175,7 @@ def _with_sensor(model: Structure, sensor: str | None) -> Structure:
     return dataclasses.replace(model, modes=model.modes.with_first_sensor(str(sensor)))
 
 
-@eqx.filter_jit
+@compiled
 def _varied(model: Structure, names: tuple[str, ...], values: Array) -> Structure:
     def numbers(row: Array) -> Structure:
         return eqx.filter(with_parameters(model, names, row), eqx.is_array)

@@ -12,9 +12,9 @@ from snrmjax.io.models import read_model
 from snrmjax.io.reduction.beam_file import is_beam_file, read_beam_models
 from snrmjax.io.tables import read_steady_states
 from snrmjax.io.toml_table import TomlTable, parsed_toml
-from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE, InputError
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.simulate.virtual_test.recording import MeasurementErrors
 from snrmjax.study.computations.base import AbstractComputation, OfForces
 from snrmjax.study.computations.modes import DampedModes, NormalModes

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.numerics.compiled import compiled, jitted, numbers_as_arrays
+from snrmjax.numerics.compiled import compiled, numbers_as_arrays
 
 
 @compiled
@@ -51,7 +51,7 @@ class Line(eqx.Module):
     slope: float
     name: str = eqx.field(static=True, default="line")
 
-    @jitted
+    @compiled
     def at(self, x, *, offset=0.0):
         """The ordinate at x."""
         return self.slope * x + offset

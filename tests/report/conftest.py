@@ -4,7 +4,7 @@ import pytest
 from truths.beam_forces import FORCES
 
 import snrmjax as sj
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 
 
 @pytest.fixture(scope="session")

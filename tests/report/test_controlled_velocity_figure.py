@@ -7,7 +7,7 @@ from truths.balanced_sets import OMEGA, PARTICIPATION, SHAPE, ZETA, linear_model
 
 import snrmjax as sj
 from snrmjax.diagnose.response_prediction import controlled_velocity_curves
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report.figures.diagnosis import controlled_velocity_figure
 
 HELD = (0.02, 0.05)  # m/s

@@ -15,8 +15,8 @@ from snrmjax.diagnose.location.laws_at_points import LocatedLaw
 from snrmjax.diagnose.location.where import Localisation, LocatedForce
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.verdict import Verdict
-from snrmjax.io.units import HERTZ
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.numerics.units import HERTZ
 from snrmjax.pipelines.diagnose import DiagnosedTest, simulated_levels
 from snrmjax.report import style as drawing
 from snrmjax.report.figures import diagnosis as plot

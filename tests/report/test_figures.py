@@ -17,7 +17,7 @@ from truths.printed_page import unreadable
 import snrmjax as sj
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.results import write_backbone
-from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.report import style as drawing
 from snrmjax.report.figures import identification as plot
 from snrmjax.report.figures.simulation import normal_mode_figure, simulated_response_figure

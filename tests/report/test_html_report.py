@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 
 import snrmjax as sj
 from snrmjax.identify.pointwise.prediction import Resonance
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report import html as reports
 from snrmjax.report.figures.identification import backbone_figure, response_figure
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, write_report

@@ -14,7 +14,7 @@ import snrmjax as sj
 from snrmjax.identify.inference.contributions import Contribution, contributions
 from snrmjax.identify.inference.fitted_response import fitted_response
 from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
-from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.pipelines.identify import FitDetails
 from snrmjax.report import sampling as plot_data
 from snrmjax.report.figures import joint_fit as joint_plot

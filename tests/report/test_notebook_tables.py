@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 
 SENSOR = "tip & <b>"
 

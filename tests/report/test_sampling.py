@@ -7,7 +7,7 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.identify.pointwise.prediction import PredictedResponse
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report import sampling as plot_data
 
 # Five points up and down a peak of 8 m/s; the second sensor moves half as far.

@@ -9,7 +9,7 @@ from truths.beam_forces import FORCES
 from truths.printed_page import unreadable
 
 import snrmjax as sj
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report.figures import simulation as plot
 from snrmjax.report.style import SERIES
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 import snrmjax as sj
 from snrmjax.io.results import write_response
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.solutions import forced_response, from_rest
 
 FORCE, ENDS = 0.12, (1.0, 4.0)

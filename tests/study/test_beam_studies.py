@@ -7,7 +7,7 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.cli import main
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.study.computations.base import MEMBER, AbstractComputation, Output
 from snrmjax.study.identity import description, differences
 

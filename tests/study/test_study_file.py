@@ -5,7 +5,7 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.cli import main
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.study.variations import LogNormal, Uniform
 
 MODEL = """

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyuff
 
-from snrmjax.io.units import HERTZ, in_unit
+from snrmjax.numerics.units import HERTZ, in_unit
 
 _TYPES = {
     "displacement": 8,

@@ -17,7 +17,7 @@ from snrmjax.condense.elements.strain_energy import (
 from snrmjax.condense.load_cases import ReductionBasis
 from snrmjax.model.modes import have_values
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.rules import FRACTION, InputError, require
 
 _MIDSPAN_NODE = 0.05  # of the largest displacement, below which midspan counts as a node
 _MECHANISM = 1e-10  # of the largest squared frequency a beam of so many elements could have
@@ -112,7 +112,7 @@ def _sign(beam: Beam, shapes: Float[Array, "free mode"]) -> Float[Array, " mode"
 
 def shape_at(beam: Beam, basis: ReductionBasis, fraction: float) -> Float[Array, " mode"]:
     """Transverse mode shapes at a fraction of the length, kg^-1/2, as for a sensor."""
-    _check_fraction(fraction)
+    require("a position as a fraction of the length", fraction, FRACTION)
     return interpolation(beam, fraction)[1] @ basis.shapes
 
 
@@ -127,8 +127,3 @@ def participation(
     if at is None:
         return uniform_load(beam) @ basis.shapes
     return shape_at(beam, basis, at)
-
-
-def _check_fraction(fraction: float) -> None:
-    if not 0 <= fraction <= 1:
-        raise InputError(f"a position must be a fraction of the length, but is {fraction:g}.")

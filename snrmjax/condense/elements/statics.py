@@ -54,7 +54,7 @@ class StaticSolutions(eqx.Module):
         return self.status == StaticStatus.CONVERGED
 
 
-@eqx.filter_jit
+@compiled
 def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSolutions:
     """Solve ∂U/∂u = F for each load case, on the stable path from rest.
 

@@ -66,10 +66,10 @@ def mass_matrix(beam: Beam) -> Float[Array, "dof dof"]:
     return mass
 
 
-def interpolation(beam: Beam, fraction: float) -> Float[Array, "3 dof"]:
+def interpolation(beam: Beam, fraction: float | Float[Array, ""]) -> Float[Array, "3 dof"]:
     """Matrix that interpolates x, y (m) and rotation (rad) at a fraction of the length."""
     n = beam.elements
-    element = min(int(fraction * n), n - 1)
+    element = jnp.minimum(jnp.floor(fraction * n).astype(int), n - 1)
     t, s = fraction * n - element, beam.arc_length / n
     rows = jnp.zeros((3, 6))
     rows = rows.at[0, jnp.array([0, 3])].set(jnp.array([1 - t, t]))
@@ -89,7 +89,7 @@ def interpolation(beam: Beam, fraction: float) -> Float[Array, "3 dof"]:
     rows = rows.at[2, jnp.array([[1, 4], [2, 5]])].set(slope)
     rotation = _rotations(beam)[element]
     rows = rotation[:3, :3].T @ rows @ rotation
-    return jnp.zeros((3, beam.n_dof)).at[:, _connectivity(n)[element]].set(rows)
+    return jnp.zeros((3, beam.n_dof)).at[:, 3 * element + np.arange(6)].set(rows)
 
 
 def uniform_load(beam: Beam) -> Float[Array, " dof"]:

@@ -26,6 +26,7 @@ from snrmjax.diagnose.misfit.predictions import Predicted
 from snrmjax.diagnose.misfit.programs import COMPARED
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
 STATES = 12
 """Number of states of a further test."""
@@ -266,7 +267,7 @@ class _Hypothesis:
         operating_point = OperatingPoint(
             level=int(self.misfit.level_numbers[points.level]),
             force=test.force[option.points],
-            frequency=test.frequency[option.points] / (2 * np.pi),
+            frequency=test.frequency[option.points] / HERTZ,
         )
         harmonics = option.orders if option.floor is not None else ()
         phase_deg = np.degrees(np.abs(points.phase))
@@ -353,7 +354,7 @@ def _difference(
         quantity, value = "velocity", float(np.abs(velocity[at]))
         values = value, value / max(1 + velocity_drop, 0.1)
     else:
-        quantity, value = "frequency", float(omega[at]) / (2 * np.pi)
+        quantity, value = "frequency", float(omega[at]) / HERTZ
         values = value, value * (1 + shift)
     return quantity, Fact("resonances_apart", models=models, quantity=quantity, values=values)
 

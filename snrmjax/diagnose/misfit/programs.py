@@ -29,6 +29,7 @@ from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.balance.harmonics import displacement_phasors, harmonic_basis
 from snrmjax.simulate.balance.prescribed_motion import Secants, batched_zero, start_of
@@ -247,7 +248,7 @@ class _Resonance(AbstractForce):
         slope = jnp.asarray(basis.synthesis @ basis.derivative) @ (jnp.asarray(basis.analysis) @ q)
         omega = jnp.sqrt(jnp.sum(velocity**2) / jnp.sum(slope**2))
         load = displacement_phasors((jnp.asarray(basis.analysis) @ q**n)[:, None])[:, 0]
-        natural = 2 * jnp.pi * jnp.asarray(mode.frequency_hz)
+        natural = HERTZ * jnp.asarray(mode.frequency_hz)
         rate = jnp.arange(self.harmonics + 1) * omega
         stiffness = natural**2 - rate**2 + 2j * mode.damping_ratio * natural * rate
         response = -mode.coefficient * load / stiffness

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Array, Complex
 
 from snrmjax.diagnose.kinds.registry import hypothesis_of, starts_of
 from snrmjax.diagnose.readings import Readings
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effects import EFFECTS, is_own, make_effect
+from snrmjax.numerics.compiled import compiled
 
 _SAMPLES, _AMPLITUDES = 256, 60  # for a user's own force
 _PARTS = 3  # of a shape's interval, when refined
@@ -84,7 +85,7 @@ def _of_own_force(readings: Readings, kind: str) -> list[Column]:
     columns = []
     for start in starts:
         law: Any = make_effect(kind, dict(zip(names, start, strict=True)))
-        force = np.asarray(jax.jit(jax.vmap(law.cycle_force))(q, rate))
+        force = np.asarray(_cycle_forces(law, q, rate))
         unit = readings.natural_frequency**2 * readings.largest * grid
         of_states = []
         for order in (1, *(one.order for one in readings.harmonics)):
@@ -93,6 +94,11 @@ def _of_own_force(readings: Readings, kind: str) -> list[Column]:
         changes = of_states[0], np.array(of_states[1:]).reshape(-1, len(x))
         columns += _scaled(kind, *changes, fraction=1 / len(starts), start=start)
     return columns
+
+
+@compiled
+def _cycle_forces(law: AbstractForce, q: Array, rate: Array) -> Array:
+    return jax.vmap(law.cycle_force)(q, rate)
 
 
 def _column(

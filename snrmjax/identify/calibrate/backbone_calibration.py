@@ -18,7 +18,7 @@ from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
 from snrmjax.numerics.result import Variable, quantity
 from snrmjax.numerics.rules import InputError
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.solutions.mode_at_velocities import normal_mode_at_velocities
 
 _LARGEST_LOG_CHANGE = np.log(10.0)  # of a parameter from its starting value, up or down

@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.special import expit
 
+from snrmjax.numerics.compiled import compiled
+
 Argument = Literal["displacement", "velocity"]
 
 _KIND_WORDS = {
@@ -146,7 +148,7 @@ class AbstractCurve(eqx.Module):
         return Linearised(*map(np.asarray, _by_program(self, jnp.asarray(amplitude))))
 
 
-@eqx.filter_jit
+@compiled
 def _by_program(curve: AbstractCurve, at: Array) -> Linearised:
     def of(parameters: Array, at: Array) -> Array:
         return eqx.tree_at(lambda f: f.parameters, curve, parameters)(at)

@@ -21,6 +21,7 @@ from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.newton import ROUNDING, newton
 from snrmjax.numerics.result import quantity, setting
 
 _BLOCK = 256  # points per compiled call
@@ -171,7 +172,6 @@ def _bands(
 
 
 _ITERATIONS = 12
-_SETTLED = 1e-9  # relative Newton step at convergence
 _FARTHEST = 0.2  # relative, from the initial point
 
 Kind = Literal["resonance", "fold"]
@@ -283,16 +283,14 @@ def _point_with_slopes(
         ]
         return jnp.where(is_fold, jnp.stack([excess, slope * x]), jnp.stack(resonance))
 
-    def step(_: int, point: Array) -> Array:
-        jacobian = jax.jacfwd(equations)(point, vector)
-        return point - jnp.linalg.solve(jacobian, equations(point, vector))
+    def linearised(point: Array) -> tuple[Array, Array]:
+        return equations(point, vector), jax.jacfwd(equations)(point, vector)
 
-    point = jax.lax.fori_loop(0, _ITERATIONS, step, jnp.ones(2))
-    # Convergence by the next Newton step: residuals scale with the steep slopes of light damping.
-    jacobian, by_vector = jax.jacfwd(equations, argnums=(0, 1))(point, vector)
-    newton_step = jnp.linalg.solve(jacobian, equations(point, vector))
-    converged = jnp.all(jnp.abs(newton_step) < _SETTLED) & jnp.all(jnp.abs(point - 1.0) < _FARTHEST)
-    along = -jnp.linalg.solve(jacobian, by_vector)
+    # Convergence by the last step: residuals scale with the steep slopes of light damping.
+    root = newton(linearised, jnp.ones(2), most=_ITERATIONS)
+    point, settled = root.one_more(within=ROUNDING)
+    converged = settled & jnp.all(jnp.abs(point - 1.0) < _FARTHEST)
+    along = -jnp.linalg.solve(root.jacobian, jax.jacfwd(equations, argnums=1)(root.point, vector))
 
     def outputs(point: Array, vector: Array) -> Array:
         x, omega = point * unit

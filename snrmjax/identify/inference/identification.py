@@ -112,7 +112,7 @@ class Identification(AbstractResult):
 
 @on_numbers("Differentiate `sj.identify.identify_points`.")
 @on_one_core
-@naming_wrong_phases
+@naming_wrong_phases(data="data", modes="modes")
 def identify_backbone(
     data: SteadyStates,
     modes: LinearModes | Structure,

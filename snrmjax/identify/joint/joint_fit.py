@@ -229,7 +229,7 @@ class JointFit(AbstractResult):
 
 @on_numbers("Differentiate `sj.identify.refit`.")
 @on_one_core
-@naming_wrong_phases
+@naming_wrong_phases(data="data", modes="modes")
 def fit_jointly(
     data: SteadyStates,
     modes: LinearModes | Structure,

@@ -273,7 +273,7 @@ def peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:
     return jnp.where(moving, peak.reshape(velocity.shape) / jnp.abs(velocity), jnp.nan)
 
 
-@eqx.filter_jit
+@compiled
 def modal_filter(
     data: SteadyStates,
     modes: LinearModes,

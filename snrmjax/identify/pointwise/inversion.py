@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
+from snrmjax.numerics.compiled import compiled
 
 _CHUNK = 1 << 14  # members solved at a time on a CPU: they fit into its cache
 
@@ -63,7 +64,7 @@ def invert_phasor(
     return _invert_phasor(*map(jnp.asarray, given))
 
 
-@jax.jit
+@compiled
 def _invert_phasor(
     modal_constant: Array, frequency: Array, velocity: Array, residual: Array
 ) -> SnrmPoints:
@@ -206,7 +207,7 @@ def _newton(member: _Member) -> tuple[Array, Array, Array]:
     return natural, damping, good
 
 
-@jax.jit
+@compiled
 def _invert(members: _Member) -> SnrmPoints:
     shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in members))
     flat = jax.tree.map(lambda a: jnp.broadcast_to(a, shape).reshape(-1), members)

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +14,7 @@ from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.snrm import is_single, nonlinear_mode_velocity, sensed_mode
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.blocks import padded
-from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity
 from snrmjax.numerics.rules import InputError
@@ -259,7 +258,7 @@ def _on_backbone(backbone: Backbone, amplitude: Float[np.ndarray, " point"]) -> 
     return _OnBackbone(amplitude, value, damping, slope, damping_slope, backbone.argument)
 
 
-@eqx.filter_jit
+@compiled
 def _values_and_slopes(
     backbone: Backbone, amplitude: Float[np.ndarray, " point"]
 ) -> tuple[Array, Array, Array, Array]:
@@ -300,7 +299,7 @@ def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: 
     )
 
 
-@eqx.filter_jit
+@compiled
 def _velocity(
     backbone: Backbone,
     modes: LinearModes,

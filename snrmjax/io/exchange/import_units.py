@@ -18,11 +18,10 @@ from snrmjax.measure.recordings.channels import DERIVATIVE, SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import near_miss
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
 """Factors to peak amplitude for sinusoidal signals."""
-
-_HERTZ = 2 * np.pi
 
 
 class Force(NamedTuple):
@@ -204,7 +203,7 @@ def frequency_in_rad(
                 f"is {mapping.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
             )
         assumed.add("frequency_unit", Fact("nothing_is_said"), "Hz")
-        return values * _HERTZ
+        return values * HERTZ
     assumed.unit("frequency_unit", mapping.frequency_unit, file_unit)
     meaning = _meaning(unit, "--frequency-unit")
     if meaning.dimension != "frequency":
@@ -239,7 +238,7 @@ def phase_in_rad(
     unit = mapping.phase_unit or of_file
     assumed.unit("phase_unit", mapping.phase_unit, of_file)
     if not unit:
-        if not np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
+        if not np.nanmax(np.abs(values), initial=0.0) > 2 * HERTZ:
             raise InputError(f"is {column} in degrees or in radians? --phase-unit deg or rad.")
         unit = "deg"
         assumed.add("phase_unit", Fact("phase_beyond_two_turns", column=column), unit)

@@ -7,8 +7,8 @@ import numpy as np
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.measure.recordings.velocity_states import number_levels
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _MOST = 40  # lines of one kind at most
 
 
@@ -25,7 +25,7 @@ def listed_contents(contents: LaboratoryFile) -> list[str]:
     for table in contents.tables:
         lines += [f"  table {table.name}: {table.n_rows} rows", *_columns(table)]
     for sets, z in zip(contents.responses[:_MOST], contents.levels, strict=False):
-        hertz = sets.frequency / _HERTZ
+        hertz = sets.frequency / HERTZ
         level = f", z axis {z:g}" if np.isfinite(z) else ""
         lines.append(
             f"  responses {sets.name}: {len(sets.responses)} over {len(sets.references)} at "

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, get_args
 from snrmjax.io.files import shown
 from snrmjax.measure.recordings.channels import Quantity
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 _LONGEST = 40
 _ALLOWED = re.compile(r"[A-Za-zµμΩ°%/*^·.()0-9 _+\-⁻¹²³]*")
@@ -163,7 +164,7 @@ def unit_meaning(text: str) -> UnitMeaning:
     alike = (name for name, of in _DIMENSIONS.items() if powers[:4] == of[:4])
     dimension = next(alike, "other")
     if dimension == "frequency" and not powers[4]:
-        factor *= 2 * math.pi
+        factor *= HERTZ
     if dimension == "angle" and not powers[4]:
         dimension = "other"
     return UnitMeaning(dimension, value * factor, amplitude)

@@ -30,7 +30,7 @@ import jax
 import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
-from snrmjax.numerics.kept_programs import NotKept, keep_programs_with
+from snrmjax.numerics.compiled import NotKept, keep_programs_with
 
 try:  # trace state besides arguments; compile time from which JAX caches a program itself
     from jax._src.config import disable_jit, trace_context

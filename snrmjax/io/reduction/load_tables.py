@@ -48,10 +48,10 @@ from snrmjax.io.files import FilePath, read_text, shown
 from snrmjax.io.rows import Cells, read_cells
 from snrmjax.io.tables import write_table
 from snrmjax.io.toml_table import TomlTable, parsed_toml
-from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.names import suggestion
 from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, POSITIVE, InputError
+from snrmjax.numerics.units import HERTZ
 
 _KEYS = ("name", "numbers", "damping_ratio", "shapes", "mass", "participation", "sensors")
 _NUMBERED = re.compile(r"([a-z]+)_([1-9][0-9]{0,5})")

@@ -63,7 +63,7 @@ def unwrapped_phase(track: ToneTrack) -> Float[np.ndarray, " frame"]:
 
 def check_rate(recording: TimeRecording, frequency: float, name: str) -> None:
     """Raises `ValueError` for a frequency (rad/s) with fewer than four samples per cycle."""
-    samples = 2 * np.pi * recording.sampling_rate / frequency
+    samples = HERTZ * recording.sampling_rate / frequency
     if samples < _FEWEST_SAMPLES * (1 - 1e-9):
         raise InputError(
             f"a record needs {_FEWEST_SAMPLES} samples per cycle, but channel {name} has "

@@ -12,6 +12,7 @@ from jaxtyping import Complex, Float
 
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import ToneTrack
+from snrmjax.numerics.units import HERTZ
 
 DEGREE = 3
 _FEWEST_FRAMES = 5
@@ -48,7 +49,7 @@ def swept_phasors(
     samples.
     """
     rate = recording.sampling_rate
-    width = 2 * np.pi * cycles / wanted * rate
+    width = HERTZ * cycles / wanted * rate
     for _ in range(3):
         law = _phase_law(track, phase, sample, width)
         if law is None:

@@ -20,6 +20,8 @@ from numpy.polynomial import chebyshev
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
+from snrmjax.numerics.units import HERTZ
+
 _LARGEST = 4.0  # (ρ/scale)² that a trial step may reach
 _TOLERANCE = 1e-9
 _NODES_A_CYCLE = 1.0  # of the slow flow, between which it is interpolated
@@ -156,7 +158,7 @@ def _slow_flow(
     initial = np.zeros(4 + 3 * terms)
     initial[:2], initial[2] = form.start, 1.0
     span = time[-1] - time[0]
-    cycles = span * abs(form.frequency[0]) / (2 * np.pi)
+    cycles = span * abs(form.frequency[0]) / HERTZ
     nodes = np.linspace(0, span, int(np.clip(cycles * _NODES_A_CYCLE, 50, _MOST_NODES)))
     solution = solve_ivp(
         rate, (0, span), initial, "DOP853", t_eval=nodes, rtol=_TOLERANCE, atol=_TOLERANCE

@@ -27,9 +27,9 @@ from snrmjax.measure.sweeps.sweep_runs import sweep_runs
 from snrmjax.model.modes import LinearModes, reference_sensor
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 _MOTIONS = ("velocity", "acceleration", "displacement")
-_HERTZ = 2 * np.pi
 _PARTS = 8
 _RISE = 0.05  # of the first part's rms: allowed increase from part to part (noise, beats)
 _DECAYED = 0.95  # of the first part's rms: upper limit of the last
@@ -130,7 +130,7 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, parts, frequency)
     low, high = _band(recording.values([guide], 0, _MOST_SAMPLES)[0], recording.sampling_rate)
     _require_near_mode(recording, low, high, rest)
-    why = Fact("drive_is_no_tone", channel=guide, low_hz=low / _HERTZ, high_hz=high / _HERTZ)
+    why = Fact("drive_is_no_tone", channel=guide, low_hz=low / HERTZ, high_hz=high / HERTZ)
     return RecordedTest(recording, channels, RecordKind.BROADBAND, why, (), frequency)
 
 
@@ -220,7 +220,7 @@ def _free_stretches(
     except InputError:  # the drive never stops; other causes were excluded before
         return ()
     return tuple(
-        (free.start + int(np.ceil(_HERTZ * recording.sampling_rate / free.frequency)), free.stop)
+        (free.start + int(np.ceil(HERTZ * recording.sampling_rate / free.frequency)), free.stop)
         for free in ring_downs
     )
 
@@ -243,7 +243,7 @@ def _tone_kind(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[
     steps = [
         step
         for step in recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
-        if (step.stop - step.start) * step.frequency / _HERTZ / rate >= _STEP_CYCLES
+        if (step.stop - step.start) * step.frequency / HERTZ / rate >= _STEP_CYCLES
     ]
     covered = sum(step.stop - step.start for step in steps) / max(float(np.ptp(track.middle)), 1.0)
     stays = moves_within_steps(steps, track, rate) < _MOVES
@@ -254,14 +254,14 @@ def _tone_kind(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[
         return RecordKind.SLOW_SWEEP, Fact("tone_that_moves", channel=guide, n=len(runs))
     raise InputError(
         f"{recording.name}: {guide} is a single tone of "
-        f"{np.median(track.frequency) * rate / _HERTZ:.5g} Hz, which gives no backbone."
+        f"{np.median(track.frequency) * rate / HERTZ:.5g} Hz, which gives no backbone."
     )
 
 
 def _spectrum(values: Float[np.ndarray, " sample"], rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies in rad/s and power."""
     power = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(len(values)))) ** 2
-    return _HERTZ * np.fft.rfftfreq(len(values), 1 / rate), power
+    return HERTZ * np.fft.rfftfreq(len(values), 1 / rate), power
 
 
 def _strongest(motion: Float[np.ndarray, " sample"], rate: float) -> float:
@@ -279,7 +279,7 @@ def _decay_frequency(
     decaying = motion[fall.start :] - motion.mean()
     window = np.hanning(2 * len(decaying))[len(decaying) :]
     power = np.abs(np.fft.rfft(decaying * window)) ** 2
-    omega = _HERTZ * np.fft.rfftfreq(len(decaying), 1 / rate)
+    omega = HERTZ * np.fft.rfftfreq(len(decaying), 1 / rate)
     near = (omega > rest / _FAR) & (omega < rest * _FAR)
     if power[near].sum() > _LEAST_POWER * power[1:].sum():
         power = np.where(near, power, 0.0)
@@ -296,8 +296,8 @@ def _band(force: Float[np.ndarray, " sample"], rate: float) -> tuple[float, floa
 def _require_near_mode(recording: TimeRecording, low: float, high: float, rest: float) -> None:
     if low / _FAR <= rest <= high * _FAR:
         return
-    where = f"{low / _HERTZ:.4g}" if high == low else f"{low / _HERTZ:.4g} to {high / _HERTZ:.4g}"
+    where = f"{low / HERTZ:.4g}" if high == low else f"{low / HERTZ:.4g} to {high / HERTZ:.4g}"
     raise InputError(
         f"{recording.name} is at {where} Hz, but the mode of interest is at "
-        f"{rest / _HERTZ:.4g} Hz: is its time in seconds, and is it a test of this mode?"
+        f"{rest / HERTZ:.4g} Hz: is its time in seconds, and is it a test of this mode?"
     )

@@ -10,8 +10,8 @@ from snrmjax.measure.recordings.channels import channel_number
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _CORNER = 0.25  # of the motion's frequency: below it an integrated signal is drift
 _ORDER = 4  # at the motion's frequency the filter is then 1 within 2e-5
 _ENDS = 8.0  # cycles at both ends until it has settled
@@ -47,7 +47,7 @@ def recorded_velocity(
     values = recording.values([name], start, stop)[0]
     time, signal = even_record(recording.time(start, stop), values - values.mean())
     notes: tuple[Fact, ...] = ()
-    cycle = max(1, int(np.ceil(_HERTZ * recording.sampling_rate / frequency)))
+    cycle = max(1, int(np.ceil(HERTZ * recording.sampling_rate / frequency)))
     if quantity != "velocity":
         from scipy.interpolate import make_interp_spline
 
@@ -65,7 +65,7 @@ def recorded_velocity(
                 f"{len(signal) / cycle:.3g}."
             )
         sections = butter(
-            _ORDER, _CORNER * frequency, "highpass", fs=_HERTZ * recording.sampling_rate,
+            _ORDER, _CORNER * frequency, "highpass", fs=HERTZ * recording.sampling_rate,
             output="sos",
         )  # fmt: skip
         signal = sosfiltfilt(sections, signal)[ends:-ends]

@@ -9,7 +9,6 @@ equation 3; for periodic motions of such models, harmonic balance in discrete ti
 """
 
 import itertools
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,6 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
+
+from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.newton import newton
 
 _HARMONICS = 7
 _ANGLES = 64
@@ -89,7 +91,7 @@ class Resonances(NamedTuple):
     slopes: Float[Array, "2 amplitude coefficient"]  # of angle and force over the coefficients
 
 
-@partial(jax.jit, static_argnames=("exponents", "mode"))
+@compiled
 def model_resonances(
     model: StateSpace, amplitudes: Float[Array, " amplitude"], exponents: Exponents, mode: int
 ) -> Resonances:
@@ -131,21 +133,19 @@ def model_resonances(
         )
         return jnp.concatenate([balance.ravel(), prescribed])
 
-    by_unknowns = jax.jacfwd(residual)
+    by_unknowns, by_model = jax.jacfwd(residual), jax.jacfwd(residual, argnums=1)
 
-    def newton(unknowns: Array, amplitude: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-        def step(_: int, point: Array) -> Array:
-            matrix = by_unknowns(point, flat, amplitude)
-            return point - jnp.linalg.solve(matrix, residual(point, flat, amplitude))
+    def motion(unknowns: Array, amplitude: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+        def linearised(point: Array) -> tuple[Array, Array]:
+            return residual(point, flat, amplitude), by_unknowns(point, flat, amplitude)
 
-        point = jax.lax.fori_loop(0, _STEPS, step, unknowns)
-        matrix = by_unknowns(point, flat, amplitude)
-        by_coefficients = jax.jacfwd(residual, argnums=1)(point, flat, amplitude)
-        slopes = -jnp.linalg.solve(matrix, by_coefficients)[:2]
+        root = newton(linearised, unknowns, most=_STEPS)
+        point, by_coefficients = root.one_more()[0], by_model(root.point, flat, amplitude)
+        slopes = -jnp.linalg.solve(root.jacobian, by_coefficients)[:2]
         error = jnp.max(jnp.abs(residual(point, flat, amplitude)))
         return point, (point[:2], slopes, error)
 
-    _, (resonance, slopes, errors) = jax.lax.scan(newton, _linear_motion(model, mode), amplitudes)
+    _, (resonance, slopes, errors) = jax.lax.scan(motion, _linear_motion(model, mode), amplitudes)
     return Resonances(resonance[:, 0], resonance[:, 1], errors, jnp.moveaxis(slopes, 1, 0))
 
 

@@ -44,7 +44,9 @@ from snrmjax.methods.records.state_space_start import (
     regressed,
 )
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 _PER_CYCLE = 32.0  # samples of the model per cycle of the mode
 _FEWEST_SAMPLES = 4.5  # of a record per cycle of the mode
@@ -182,9 +184,9 @@ def _mode_frequency(linear: MultisineResponses, modes: LinearModes | None) -> fl
     natural = modes.natural_frequency.item(modes.mode_of_interest)
     if not frequency[0] <= natural <= frequency[-1]:
         raise InputError(
-            f"lines around the mode at {natural / (2 * np.pi):.4g} Hz are needed, but the records "
-            f"have them from {frequency[0] / (2 * np.pi):.4g} to "
-            f"{frequency[-1] / (2 * np.pi):.4g} Hz."
+            f"lines around the mode at {natural / HERTZ:.4g} Hz are needed, but the records "
+            f"have them from {frequency[0] / HERTZ:.4g} to "
+            f"{frequency[-1] / HERTZ:.4g} Hz."
         )
     return natural
 
@@ -208,13 +210,13 @@ def _mean_periods(
     """Mean periods, resampled by their spectra (periodic records: exactly) and scaled."""
     rate = records[0].sampling_rate
     samples = round(linear.period * rate)
-    if rate < _FEWEST_SAMPLES * natural / (2 * np.pi):
+    if rate < _FEWEST_SAMPLES * natural / HERTZ:
         raise InputError(
-            f"{_FEWEST_SAMPLES:g} samples a cycle of the mode at {natural / (2 * np.pi):.4g} Hz "
+            f"{_FEWEST_SAMPLES:g} samples a cycle of the mode at {natural / HERTZ:.4g} Hz "
             f"are needed, but the records have {rate:g} Hz: the sampling rate is too low."
         )
     # A multiple of the number of stretches, a power of two.
-    cycles = linear.period * natural / (2 * np.pi)
+    cycles = linear.period * natural / HERTZ
     wanted = _STRETCHES * round(cycles * _PER_CYCLE / _STRETCHES)
     most = _MOST_SAMPLES // wanted
     if most < 1:
@@ -223,7 +225,7 @@ def _mean_periods(
             f"{_PER_CYCLE:g} a cycle: record shorter periods."
         )
     names = (channels[0], channels[1].name)
-    line = 2 * np.pi * np.arange(1, samples // 2 + 1) / linear.period
+    line = HERTZ * np.arange(1, samples // 2 + 1) / linear.period
     factor = np.concatenate([[0.0], velocity_factors([channels[1]], [1], line)[:, 0, 0]])
     both = np.stack([np.ones_like(factor), factor])
     means, noise = [], []
@@ -251,12 +253,12 @@ def _mean_periods(
     )
 
 
-@partial(jax.jit, static_argnames="exponents")
+@compiled
 def _outputs(model: StateSpace, starts: Array, force: Array, exponents: Exponents) -> Array:
     return jax.vmap(lambda x, u: simulated_output(model, x, u, exponents))(starts, force)
 
 
-@partial(jax.jit, static_argnames="exponents")
+@compiled
 def _output_slopes(
     model: StateSpace, starts: Array, force: Array, exponents: Exponents
 ) -> tuple[Array, Array]:
@@ -304,7 +306,7 @@ def _misfit(start: Start, periods: Periods, exponents: Exponents) -> float:
 def _over_stretches(start: Start, periods: Periods, exponents: Exponents, natural: float) -> Start:
     """The model refined over stretches of a few cycles, each from a state of its own."""
     count, samples = periods.force.shape
-    cycles = samples / periods.rate * natural / (2 * np.pi)
+    cycles = samples / periods.rate * natural / HERTZ
     pieces = min(_STRETCHES, 2 ** max(0, int(np.log2(max(cycles / _CYCLES, 1.0)))))
     length, states = samples // pieces, start.states.shape[2]
     force = jnp.asarray(periods.force.reshape(-1, length))
@@ -397,7 +399,7 @@ def _with_own_states(slopes: np.ndarray, shared: int) -> np.ndarray:
 
 def _lines(periods: Periods, natural: float) -> np.ndarray:
     """Fitted lines."""
-    highest = HIGHEST * natural / (2 * np.pi * periods.rate) * periods.force.shape[1]
+    highest = HIGHEST * natural / HERTZ / periods.rate * periods.force.shape[1]
     return np.arange(1, min(len(periods.noise), int(highest)))
 
 

@@ -19,8 +19,10 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.measure.recordings.multisine import MultisineResponses
 from snrmjax.methods.records.state_space import Exponents, StateSpace, hold, response
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 HIGHEST = 4.0
 """Times the mode's frequency: highest fitted line, beyond the third harmonic."""
@@ -132,9 +134,9 @@ def regressed(periods: Periods, natural: float, exponents: Exponents) -> Start |
     count = periods.force.shape[1]
     spectra = np.fft.rfft(periods.velocity, axis=1)
     line = np.arange(spectra.shape[1])
-    highest = HIGHEST * natural / (2 * np.pi * periods.rate) * count
+    highest = HIGHEST * natural / HERTZ / periods.rate * count
     spectra[:, (line == 0) | (line > highest)] = 0
-    angular_rate = np.where(line == 0, 1.0, 2 * np.pi * line / count * periods.rate / natural)
+    angular_rate = np.where(line == 0, 1.0, HERTZ * line / count * periods.rate / natural)
     signals = [
         np.fft.irfft(spectrum, count, axis=1)
         for spectrum in (spectra, spectra / (1j * angular_rate))
@@ -164,7 +166,7 @@ def regressed(periods: Periods, natural: float, exponents: Exponents) -> Start |
     return Start(model, now)
 
 
-@jax.jit
+@compiled
 def _response_slopes(model: StateSpace, z: Array) -> tuple[Array, Array]:
     flat, rebuild = ravel_pytree(model)
 

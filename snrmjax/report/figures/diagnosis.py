@@ -13,7 +13,6 @@ from matplotlib.ticker import MaxNLocator
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.response_prediction import ControlledVelocityCurve, at_curve_force
-from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import (
     AbstractAddedMode,
@@ -27,6 +26,7 @@ from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.report.sampling import sensor_index
 from snrmjax.report.sentences.diagnose import effect_name
 from snrmjax.report.style import (

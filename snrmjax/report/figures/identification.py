@@ -19,12 +19,12 @@ from snrmjax.identify.pointwise.prediction import (
     PredictedResponse,
     Resonance,
 )
-from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import force_velocity_loop
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.report.sampling import (
     BAND,
     VELOCITY,

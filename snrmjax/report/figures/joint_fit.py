@@ -12,8 +12,8 @@ from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurement
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
-from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.report.sampling import (
     BAND,
     VELOCITY,

@@ -9,7 +9,7 @@ from matplotlib.ticker import MultipleLocator
 
 from snrmjax.identify.modal.free_decay import DecayModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report.style import (
     COLUMN,
     EXCLUDED,

@@ -10,9 +10,8 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.numerics.rules import InputError
-from snrmjax.numerics.units import unit_in_print
+from snrmjax.numerics.units import DEGREE, HERTZ, unit_in_print
 from snrmjax.report.sampling import BAND, sensor_index, velocity_of
 from snrmjax.report.style import (
     BACKGROUND,

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from snrmjax.identify.inference.identification import Identification
-from snrmjax.io.units import HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.pipelines.folded_records import FoldedRecord
 from snrmjax.report.figures.live import (
     legend_at_right,

@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.tables import write_table
-from snrmjax.io.units import HERTZ
 from snrmjax.methods.comparison import METHODS, Comparison
 from snrmjax.methods.record_comparison import RECORD_METHODS
 from snrmjax.methods.result import MethodResult, MethodStatus
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, number, write_report
 from snrmjax.report.style import (
     COLUMN,

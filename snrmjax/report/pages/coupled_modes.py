@@ -11,9 +11,8 @@ from snrmjax.identify.coupled.coupled_test import CoupledDetails
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.io import results
 from snrmjax.io.models import write_model
-from snrmjax.io.units import HERTZ
 from snrmjax.model.parameters import parameter_unit
-from snrmjax.numerics.units import unit_in_print
+from snrmjax.numerics.units import HERTZ, unit_in_print
 from snrmjax.report.figures.simulation import simulated_response_figure
 from snrmjax.report.html import ReportFigure, ReportTable, Section, with_error
 from snrmjax.report.style import (

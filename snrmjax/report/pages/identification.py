@@ -14,8 +14,8 @@ from snrmjax.identify.pointwise.prediction import (
     PredictedResponse,
     Resonance,
 )
-from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.report.html import (
     PROGRAM,
     Report,

@@ -11,8 +11,8 @@ from snrmjax.identify.prediction.resonance_distribution import where_in_words
 from snrmjax.io import joint_results, results
 from snrmjax.io.files import write_summary
 from snrmjax.io.results import load_named
-from snrmjax.io.units import HERTZ
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.units import HERTZ
 from snrmjax.pipelines.identify import FitDetails, IdentifiedTest
 from snrmjax.pipelines.predictions import Prediction
 from snrmjax.report.figures import identification as plot

@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.io.exchange.exports import write_import
 from snrmjax.io.exchange.importing import Imported
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.report.sentences import number_of
 
 

@@ -10,7 +10,7 @@ from snrmjax.identify.inference.optimal_design import NextMeasurement
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.joint_results import summarise_fit
-from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.pipelines.identify import FitDetails
 from snrmjax.report.figures.joint_fit import (
     FitSeries,

@@ -9,8 +9,7 @@ from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.scaling.scaled_modes import ScaledModes
 from snrmjax.io.models import write_model
 from snrmjax.io.tables import write_table
-from snrmjax.io.units import HERTZ
-from snrmjax.numerics.units import unit_in_print
+from snrmjax.numerics.units import HERTZ, unit_in_print
 from snrmjax.pipelines.modes import LinearModesFound
 from snrmjax.report.figures.modes import (
     decay_figure,

@@ -15,8 +15,8 @@ from snrmjax.condense.scale_study import (
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.models import write_model
 from snrmjax.io.reduction.load_tables import write_load_cases
-from snrmjax.io.units import HERTZ
 from snrmjax.model.potential import monomial_key
+from snrmjax.numerics.units import HERTZ
 from snrmjax.pipelines.reduce import Reduction
 from snrmjax.report.figures.reduction import (
     quality_figure,

@@ -6,7 +6,7 @@ import numpy as np
 
 from snrmjax.io import results
 from snrmjax.io.files import write_summary
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.pipelines.simulate import SimulatedMode, SimulatedResponses
 from snrmjax.report.figures.simulation import (
     event_curve_figure,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from snrmjax.doctor.findings import Checkup
 from snrmjax.io.laboratory.checkups import write_checkup
 from snrmjax.io.tables import write_steady_states
-from snrmjax.io.units import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.pipelines.whole_test import WholeTest
 from snrmjax.report.figures.live import NEEDED, has_bokeh
 from snrmjax.report.figures.state_explorer import state_explorer

@@ -19,7 +19,7 @@ from snrmjax.model.elements import ForceGroup, elements_of
 from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.moving_base import newtons
 from snrmjax.model.structures import Structure, linear_terms_of
-from snrmjax.numerics.compiled import as_numpy, compiled, jitted
+from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonics import (
     alias_free_samples,
@@ -193,7 +193,7 @@ class HarmonicBalance(eqx.Module):
         return blocks, elements.on_modes(jnp.asarray(basis.analysis) @ change)
 
 
-@jitted
+@compiled
 def _balanced(balance: HarmonicBalance, point: Array, *, with_jacobian: bool) -> tuple:
     """`HarmonicBalance._balance`, traced once for all programs that solve it.
 

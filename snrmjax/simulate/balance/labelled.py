@@ -8,7 +8,6 @@ from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable
 
-HERTZ = 2 * np.pi
 _BLOCK = 256  # points per call: one block size compiles once
 _IN_PHASE, _AHEAD = "in phase with the force", "a quarter period ahead of the force"
 

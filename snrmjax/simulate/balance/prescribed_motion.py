@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.newton import newton
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_phasors
 
 # Amplitude continuation, in fractions of the measured velocity: start, first and least step.
 _SMALL, _FIRST, _SHORTEST = 1e-3, 0.15, 2e-3
-_NEAR = 1e-6  # relative Newton step after which one more is exact to rounding
 _SECANTS = 20  # most quasi-Newton steps with one updated Jacobian
 _CLOSE = 1e-5  # relative quasi-Newton step at which the error is far below any noise
 
@@ -67,25 +67,10 @@ def newton_solved(
     By Newton's method with the problem's `linearised`; NaN if it did not converge. The last step is
     differentiable and carries the derivatives, by the implicit function theorem.
     """
-    fixed = jax.lax.stop_gradient(problem)
-
-    def step(state: tuple) -> tuple:
-        point, left, jacobian, count, _ = state
-        move = jnp.linalg.solve(jacobian, left)
-        left, jacobian = fixed.linearised(point - move)
-        return point - move, left, jacobian, count + 1, jnp.max(jnp.abs(move))
-
-    def going(state: tuple) -> Array:
-        *_, count, change = state
-        return (count < 2) | ((count < 20) & (change > _NEAR))  # false for NaN
-
-    # The first step is zero, so that the equations are compiled only once.
-    nothing, eye = jnp.zeros_like(start), jnp.eye(start.shape[0])
-    first = (jax.lax.stop_gradient(start), nothing, eye, jnp.array(0), jnp.array(0.0))
-    point, _, jacobian, _, change = jax.lax.while_loop(going, step, first)
-    last = jnp.linalg.solve(jacobian, problem.equations(point))
-    left = jnp.max(jnp.abs(jax.lax.stop_gradient(last)))
-    return jnp.where((change <= _NEAR) & (left <= _NEAR), point - last, jnp.nan), jacobian
+    fixed, begin = jax.lax.stop_gradient((problem, start))
+    root = newton(fixed.linearised, begin)
+    point, good = root.one_more(problem.equations(root.point))
+    return jnp.where(good, point, jnp.nan), root.jacobian
 
 
 class PrescribedMotion(eqx.Module):

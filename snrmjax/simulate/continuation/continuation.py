@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.numerics.newton import Linearised, Number, Point, Trial
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
-from snrmjax.simulate.continuation.newton import Linearised, Number, Point, Trial
 
 _FARTHEST = 3.0  # largest step over the last one at which the cubic predictor is used
 _FIRST, _ORDINARY, _TO_END = 0, 1, 2  # the aim of a trial

@@ -20,10 +20,10 @@ from jaxtyping import Array, Float, Inexact
 
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.newton import Point
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.balance.harmonics import harmonic_basis, tangent_blocks
-from snrmjax.simulate.continuation.events import velocities_along
-from snrmjax.simulate.continuation.newton import Point
+from snrmjax.simulate.continuation.events import height, quadrature, velocities_along
 
 EventKind = Literal["fold", "peak", "phase_resonance", "period_doubling", "neimark_sacker"]
 FORCE = "force"  # the parameter that is not one of the model
@@ -63,7 +63,7 @@ class EventEquations(eqx.Module):
         self, point: Point
     ) -> tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]:
         """Balance and condition, and their Jacobian with respect to the unknowns."""
-        motion, value = point[: self.balance.size + 1], point[-1]
+        motion, value = self._motion(point), point[-1]
         residual, jacobian = self.at(value).linearised(motion)
         by_value = jax.jvp(lambda m: self.at(m).residual(motion), (value,), (jnp.ones(()),))[1]
         between = jnp.zeros((residual.shape[0], point.shape[0] - motion.shape[0] - 1))
@@ -73,7 +73,9 @@ class EventEquations(eqx.Module):
 
     def _condition(self, point: Point, jacobian: Array) -> tuple[Array, Array]:
         if self.kind == "phase_resonance":
-            value, slope = jax.value_and_grad(self._quadrature)(point)
+            value, slope = jax.value_and_grad(lambda p: quadrature(self.balance, self._motion(p)))(
+                point
+            )
             return value[None], slope[None]
         null = bordered(self.matrix(point, jacobian))
 
@@ -96,21 +98,15 @@ class EventEquations(eqx.Module):
     def _oscillates(self) -> bool:
         return self.kind == "neimark_sacker"
 
-    def _quadrature(self, point: Point) -> Array:
-        motion = point[: self.balance.size + 1]
-        return velocities_along(self.balance, motion, jnp.zeros_like(motion))[0][2]
-
-    def _height(self, motion: Point) -> Array:
-        return velocities_along(self.balance, motion, jnp.zeros_like(motion))[0][1]
+    def _motion(self, point: Point) -> Point:
+        return point[: self.balance.size + 1]
 
     def matrix(self, point: Point, jacobian: Array) -> Inexact[Array, "size size"]:
         """The matrix A that is singular at the event; `jacobian` is that of the balance."""
         size = self.balance.size
-        motion = point[: size + 1]
-        if self.kind == "fold":
-            return jacobian[:, :size]
-        if self.kind == "peak":
-            return jnp.concatenate([jacobian, jax.grad(self._height)(motion)[None]])
+        motion = self._motion(point)
+        if self.kind in ("fold", "peak"):
+            return _singular(self.kind, self.balance, motion, jacobian)
         if self.kind == "period_doubling":
             doubled, index = self._doubled(point)
             return doubled.linearised(self._in_doubled(motion))[1][np.ix_(index, index)]
@@ -128,7 +124,7 @@ class EventEquations(eqx.Module):
 
     def image(self, point: Point, vector: Inexact[Array, " size"]) -> Inexact[Array, " size"]:
         """A v, without forming A."""
-        motion, balance = point[: self.balance.size + 1], self.at(point[-1])
+        motion, balance = self._motion(point), self.at(point[-1])
 
         def along(direction: Array) -> Array:
             return jax.jvp(balance.residual, (motion,), (direction,))[1]
@@ -189,6 +185,22 @@ class EventEquations(eqx.Module):
         index = np.concatenate([[0], np.stack([2 * even - 1, 2 * even], axis=1).ravel()])
         wide = jnp.zeros((4 * order + 1, n)).at[index].set(rows)
         return jnp.append(wide.reshape(-1), 0.5 * motion[-1])
+
+
+def event_condition(kind: str, balance: HarmonicBalance, motion: Point) -> Float[Array, ""]:
+    """What vanishes at a "fold", "peak" or "phase_resonance" of a response, differentiable."""
+    if kind == "phase_resonance":
+        return quadrature(balance, motion)
+    return bordered(_singular(kind, balance, motion, balance.linearised(motion)[1])).g
+
+
+def _singular(
+    kind: str, balance: HarmonicBalance, motion: Point, jacobian: Array
+) -> Float[Array, "size size"]:
+    """The matrix that is singular at a fold or a peak."""
+    if kind == "fold":
+        return jacobian[:, : balance.size]
+    return jnp.concatenate([jacobian, jax.grad(lambda p: height(balance, p))(motion)[None]])
 
 
 def bordered(matrix: Inexact[Array, "size size"]) -> Bordered:

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from snrmjax.numerics.newton import Linearised, Point, Trial, chosen
 from snrmjax.simulate.continuation.continuation import StepControl
-from snrmjax.simulate.continuation.newton import Linearised, Point, Trial, chosen
 
 _TRIALS = 40  # most trials of the secant method
 _CLOSE = 1e-10  # change of the position between the neighbours at which the search ends

@@ -12,10 +12,10 @@ from snrmjax.model.modes import STILL
 from snrmjax.numerics.blocks import over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.lanes import TOGETHER, StateRows, in_lanes, in_rows, iterated, lanes_for
+from snrmjax.numerics.newton import correct
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import CurveEvent, StepControl, TracedCurve
 from snrmjax.simulate.continuation.event_location import Bracket, EventSearch
-from snrmjax.simulate.continuation.newton import correct
 
 EVENT_KINDS = (CurveEvent.FOLD, CurveEvent.PEAK, CurveEvent.PHASE_RESONANCE)
 _INSIDE = 7  # points added inside an interval that is refined
@@ -59,12 +59,26 @@ def velocities_along(
     )
 
 
+def height(balance: HarmonicBalance, point: Float[Array, " unknown"]) -> Float[Array, ""]:
+    """|velocity fundamental|² at the first sensor, scaled."""
+    return velocities_along(balance, point, jnp.zeros_like(point))[0][1]
+
+
+def quadrature(balance: HarmonicBalance, point: Float[Array, " unknown"]) -> Float[Array, ""]:
+    """The part of the mode's velocity a quarter period ahead of the force, scaled."""
+    return velocities_along(balance, point, jnp.zeros_like(point))[0][2]
+
+
+def sign_changes(heights: Any, slopes: Any) -> list[Any]:
+    """What changes sign at each of `EVENT_KINDS` along a curve, given `velocities_along`."""
+    return [slopes[..., 0], slopes[..., 1], heights[..., 2]]
+
+
 def _search(job: tuple, steps: StepControl) -> EventSearch:
     balance, kind, here, tangent, there = job
 
     def test(point: Array, direction: Array) -> Array:
-        heights, slopes = velocities_along(balance, point, direction)
-        return jnp.stack([slopes[0], slopes[1], heights[2]])[kind]
+        return jnp.stack(sign_changes(*velocities_along(balance, point, direction)))[kind]
 
     return EventSearch(balance.linearised, test, here, tangent, there, steps)
 
@@ -162,7 +176,7 @@ def with_events(
             continue
         same = curve is curves[number]
         heights, slopes = known[number] if same else heights_of(number, curve)
-        values = np.stack([slopes[:, 0], slopes[:, 1], heights[:, 2]], axis=1)
+        values = np.stack(sign_changes(heights, slopes), axis=1)
         change = np.signbit(values[:-1]) != np.signbit(values[1:])
         # A peak is a maximum: the slope falls through zero. A phase resonance has Re V > 0.
         change[:, 1] &= values[:-1, 1] > 0

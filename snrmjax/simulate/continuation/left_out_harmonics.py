@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, Int
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_member, mapped
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.newton import Point, solve_appended
 from snrmjax.simulate.balance.harmonic_balance import BY_CYCLE, HarmonicBalance, samples_for
-from snrmjax.simulate.continuation.newton import Point, solve_appended
 
 _TOLERANCE = 1e-7  # norm of the last correction of the scaled unknowns
 _ROUNDS = 12  # most corrections; three to five suffice

@@ -13,9 +13,10 @@ from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.numerics.blocks import by_member, mapped, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, truncation_error
 from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
-from snrmjax.simulate.balance.labelled import HERTZ, fundamental_variables
+from snrmjax.simulate.balance.labelled import fundamental_variables
 from snrmjax.simulate.continuation.bifurcations import with_bifurcations
 from snrmjax.simulate.continuation.continuation import (
     CurveEvent,

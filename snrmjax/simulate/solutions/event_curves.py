@@ -13,10 +13,9 @@ from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.result import Variable, quantity, setting
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
-from snrmjax.numerics.units import unit_in_print
+from snrmjax.numerics.units import HERTZ, unit_in_print
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import harmonic_balance, resonance_displacement
-from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.continuation import (
     Curve,
     CurveRange,

@@ -14,13 +14,13 @@ from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, on_one_core, taken
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.lanes import lanes_for
+from snrmjax.numerics.newton import correct
 from snrmjax.numerics.result import AbstractResult, quantity
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, TracedCurve
 from snrmjax.simulate.continuation.curve_tracing import response_balances
-from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.continuation.response_curve import (
     Branch,
     ResponseCurve,
@@ -370,7 +370,7 @@ def _solve_batch(
         )
         guess = balance.point(start, frequency)
         fixed = jnp.zeros_like(guess).at[-1].set(1.0)
-        end = correct(balance.linearised, guess, fixed, 1e-10, 30)
+        end = correct(balance.linearised, guess, fixed)
         return balance.coefficients(end.point), end.converged
 
     return mapped(solved, force, frequency, start)

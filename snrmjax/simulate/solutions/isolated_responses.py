@@ -14,9 +14,9 @@ from snrmjax.numerics.blocks import as_arrays, on_one_core, padded, taken
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.result import AbstractResult, Variable, setting
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.balance.given_numbers import frequency_range, positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
-from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.curve_tracing import (
     lies_on,

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.effect_shape import conservative_effects
 from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, on_one_core
-from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.given_numbers import positive
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
@@ -66,13 +66,12 @@ def normal_mode_at_velocities(
     return _at_velocities(model, wanted, harmonic_order, steps)
 
 
-@jitted
+@compiled
 def _at_velocities(
     model: Structure, velocities: Float[Array, " velocity"], harmonic_order: int, steps: int
 ) -> PeriodicMotion:
     model = simulated_structure(model)
-    kept = tuple(e for e in model.effects if not isinstance(e, AbstractHysteresis))
-    model = dataclasses.replace(model, effects=kept)
+    model = dataclasses.replace(model, effects=conservative_effects(model.effects))
     modes, j = model.modes, model.modes.mode_of_interest
     unit = jnp.abs(modes.natural_frequency[j] * modes.mode_shape[0, j])
     amplitudes = jax.lax.stop_gradient(velocities / unit)

@@ -7,9 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from snrmjax.model.effect_base import AbstractForce, AbstractMemoryless
-from snrmjax.model.effect_metadata import Argument
-from snrmjax.model.effect_shape import shape_of
+from snrmjax.model.effect_shape import conservative_effects
 from snrmjax.model.structures import (
     Structure,
     displacement_scale,
@@ -166,18 +164,11 @@ def nonlinear_normal_mode(
 def conservative(model: Structure) -> Structure:
     """The structure without damping, friction and forces that depend on velocity."""
 
-    def stays(effect: object) -> bool:
-        if not isinstance(effect, AbstractForce):
-            return True
-        shape = shape_of(type(effect))
-        elastic = shape is not None and shape.argument is Argument.DISPLACEMENT
-        return isinstance(effect, AbstractMemoryless) and elastic
-
     def with_ratio(ratio: Array) -> Structure:
         modes = dataclasses.replace(model.modes, damping_ratio=ratio, damping_coupling=None)
         return dataclasses.replace(model, modes=modes, effects=effects)
 
-    effects = tuple(effect for effect in model.effects if stays(effect))
+    effects = conservative_effects(model.effects)
     ones = as_numpy(np.ones(model.n_modes))
     # Damping ratios that cancel the damping of linear changes, which is linear in them.
     none, whole = (as_numpy(linear_terms_of(with_ratio(k * ones)).damping) for k in (0.0, 1.0))

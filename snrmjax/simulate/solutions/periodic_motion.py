@@ -9,15 +9,17 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.newton import ROUNDING, Point, newton
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
-from snrmjax.simulate.balance.labelled import HERTZ, batch_variables
+from snrmjax.simulate.balance.labelled import batch_variables
 from snrmjax.simulate.balance.not_found import nan_unless
-from snrmjax.simulate.continuation.events import velocities_along
-from snrmjax.simulate.continuation.newton import Linearised, Point
+from snrmjax.simulate.continuation.event_equations import event_condition
+from snrmjax.simulate.continuation.events import height
 
 Condition = Literal["frequency", "velocity", "fold", "peak", "phase_resonance"]
 
@@ -102,7 +104,7 @@ def periodic_motion(
     return motion_near(model, load, near, condition, target, iterations)
 
 
-@jitted
+@compiled
 def motion_near(
     model: Structure,
     force: Float[Array, ""],
@@ -137,12 +139,9 @@ def _solved(
     balance: HarmonicBalance, guess: Point, condition: Condition, target: Array, iterations: int
 ) -> tuple[Point, Array]:
     """The root of the balance and the condition, and whether it converged: see `root_of`."""
-    harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
-    border = _tangent_near(balance.linearised, harmless, _generic(guess.shape[0]))
-    border = jax.lax.stop_gradient(border)
 
     def test(balance: HarmonicBalance, target: Array, point: Point) -> Array:
-        return _test(balance, condition, target, border, point)
+        return _test(balance, condition, target, point)
 
     return root_of(balance, test, target, guess, iterations)
 
@@ -162,22 +161,12 @@ def root_of(
     harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
     fixed, aim = jax.lax.stop_gradient((balance, target))
 
-    def body(state: tuple) -> tuple:
-        point, count, _, _ = state
+    def linearised(point: Point) -> tuple[Array, Array]:
         residual, jacobian = fixed.linearised(point)
         value, slope = jax.value_and_grad(lambda p: test(fixed, aim, p))(point)
-        matrix = jnp.concatenate([jacobian, slope[None]])
-        step = jnp.linalg.solve(matrix, jnp.append(residual, value))
-        change = jnp.max(jnp.abs(step))
-        return point - step, count + 1, change, jnp.isfinite(change)
+        return jnp.append(residual, value), jnp.concatenate([jacobian, slope[None]])
 
-    def going(state: tuple) -> Array:
-        _, count, change, finite = state
-        return finite & (count < iterations) & (change > 1e-12)
-
-    state = (guess, jnp.array(0), jnp.array(jnp.inf), jnp.array(True))
-    point, _, change, finite = jax.lax.while_loop(going, body, state)
-    converged = finite & (change < 1e-8)
+    point, converged = newton(linearised, guess, most=iterations).one_more(within=ROUNDING)
     root = jax.lax.stop_gradient(jnp.where(converged, point, harmless))
 
     def equations(point: Point) -> Array:
@@ -191,37 +180,12 @@ def root_of(
     return jax.lax.custom_root(equations, root, lambda _, known: known, tangent_solve), converged
 
 
-def _test(
-    balance: HarmonicBalance, condition: Condition, target: Array, border: Point, point: Point
-) -> Array:
+def _test(balance: HarmonicBalance, condition: Condition, target: Array, point: Point) -> Array:
     """The residual of the condition."""
     if condition == "frequency":
         return point[-1] - target / balance.frequency_scale
     if condition == "velocity":
-        shape = balance.model.modes.mode_shape[0]
-        top = jnp.max(jnp.abs(shape)) ** 2
+        top = jnp.max(jnp.abs(balance.model.modes.mode_shape[0])) ** 2
         unit = balance.displacement_scale * balance.frequency_scale
-        return _seen(balance, point)[1] - (target / unit) ** 2 / top
-    if condition == "phase_resonance":
-        return _seen(balance, point)[2]
-    tangent = _tangent_near(balance.linearised, point, border)
-    if condition == "fold":
-        return tangent[-1]
-    return velocities_along(balance, point, tangent)[1][1]
-
-
-def _seen(balance: HarmonicBalance, point: Point) -> Float[Array, "4"]:
-    return velocities_along(balance, point, jnp.zeros_like(point))[0]
-
-
-def _tangent_near(linearised: Linearised, point: Point, border: Point) -> Point:
-    """The curve's tangent, of unit length along `border`."""
-    jacobian = linearised(point)[1]
-    right = jnp.zeros(point.shape[0]).at[-1].set(1.0)
-    tangent = jnp.linalg.solve(jnp.concatenate([jacobian, border[None]]), right)
-    return tangent / jnp.sqrt(tangent @ tangent)
-
-
-def _generic(size: int) -> Point:
-    """A random direction, which no tangent is orthogonal to in practice."""
-    return jnp.asarray(np.random.default_rng(size).normal(size=size) / np.sqrt(size))
+        return height(balance, point) - (target / unit) ** 2 / top
+    return event_condition(condition, balance, point)

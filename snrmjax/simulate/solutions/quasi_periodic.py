@@ -14,6 +14,7 @@ from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.result import AbstractResult, quantity, setting
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.balance.given_numbers import frequency_range
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
@@ -106,7 +107,7 @@ class QuasiPeriodicBranch(AbstractResult):
 
     def summary(self) -> tuple[str, ...]:
         """Force, range, slow period, modulation and how it ended."""
-        hertz, period = self.frequency / (2 * np.pi), self.slow_period
+        hertz, period = self.frequency / HERTZ, self.slow_period
         return (
             f"quasi-periodic motions at {self.force:.4g} {self.force_unit}: {len(hertz)} points",
             f"frequency {hertz[0]:.5g} to {hertz[-1]:.5g} Hz",

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from snrmjax.model.modes import have_values
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.compiled import jitted, numbers_as_arrays
+from snrmjax.numerics.compiled import compiled, numbers_as_arrays
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.solutions.periodic_motion import (
     Condition,
@@ -49,7 +49,7 @@ class TrackedMotion(eqx.Module):
     >>> curve = forced_response(beam, [2e-4], 480.0, 520.0, harmonic_order=1)[0]
     >>> peak = TrackedMotion(beam, 2e-4, curve.point(curve.at_events("peak")[0]), condition="peak")
     >>> slope = jax.grad(lambda force: peak.at(beam, force).amplitude)
-    >>> bool(slope(8e-4) > 0)  # four times the force: too far for `periodic_motion`
+    >>> bool(slope(8e-4) > 0)  # at four times the force
     True
     """
 
@@ -130,7 +130,7 @@ class _Path(NamedTuple):
     known: Bool[Array, ""]
 
 
-@jitted
+@compiled
 def _continued(
     known: tuple, new: tuple, motion: PeriodicMotion, condition: Condition
 ) -> PeriodicMotion:

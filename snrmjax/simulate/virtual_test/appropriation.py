@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.newton import correct
 from snrmjax.numerics.rules import InputError
 from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
-from snrmjax.simulate.continuation.newton import correct
 from snrmjax.simulate.virtual_test.recording import VisitedStates
 
 
@@ -126,7 +126,7 @@ def _at_phases(
         line = (
             jnp.zeros_like(guess).at[n + j].set(jnp.cos(phase)).at[2 * n + j].set(-jnp.sin(phase))
         )
-        end = correct(balance.linearised, guess - (line @ guess) * line, line, 1e-10, 30)
+        end = correct(balance.linearised, guess - (line @ guess) * line, line)
         omega = end.point[-1] * balance.frequency_scale
         return omega, balance.coefficients(end.point), end.converged
 

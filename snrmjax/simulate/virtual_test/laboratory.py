@@ -32,8 +32,9 @@ from snrmjax.model.effect_base import (
 from snrmjax.model.elements import elements_of
 from snrmjax.model.modes import reference_sensor
 from snrmjax.model.structures import Structure, simulated_structure
-from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.virtual_test.equipment import (
     Instruments,
     Shaker,
@@ -113,8 +114,9 @@ class Laboratory(eqx.Module):
     one newton per volt. The remaining images of the voltage alias into the force by about
     (ω period)⁴/38 of the shaker's own force, which near resonance may be several times the force
     on the structure.
-    Raises `ValueError` for impossible parameters, a rate too low, and effects of the measurement
-    or of the force's spectrum, which shaker and instruments produce here.
+    Raises `ValueError` for impossible parameters, a rate too low, a force at a node of the mode of
+    interest, and effects of the measurement or of the force's spectrum, which shaker and
+    instruments produce here.
     """
 
     structure: Structure
@@ -139,6 +141,9 @@ class Laboratory(eqx.Module):
             raise InputError(
                 "the virtual laboratory drives by a shaker, but an unbalance drives the model."
             )
+        modes = self.structure.modes
+        if not modes.driven()[modes.mode_of_interest]:
+            raise InputError("the shaker does not drive the mode of interest: move its force.")
         if self.structure.hysteretic and not self.largest_displacement > 0:
             kinds = ", ".join(effect.kind for effect in self.structure.hysteretic)
             raise InputError(
@@ -147,7 +152,7 @@ class Laboratory(eqx.Module):
             )
         if self.substeps < 1:
             raise InputError(f"`substeps` must be 1 or more, but is {self.substeps}.")
-        fastest = _fastest(self.structure, self.shaker) / (2 * np.pi)
+        fastest = _fastest(self.structure, self.shaker) / HERTZ
         if self.sampling_rate * self.substeps < _FEWEST_STEPS * fastest:
             raise InputError(
                 f"`sampling_rate` times `substeps` must be {_FEWEST_STEPS} times the highest "
@@ -170,7 +175,7 @@ class Laboratory(eqx.Module):
 
     def samples(self, cycles: float) -> int:
         """Number of samples in so many cycles of the mode of interest."""
-        return round(cycles * self.sampling_rate * 2 * np.pi / self.frequency)
+        return round(cycles * self.sampling_rate * HERTZ / self.frequency)
 
     def at_rest(self, controller: AbstractController) -> LabState:
         """The state of the structure at rest."""
@@ -234,7 +239,7 @@ def run_test(
     return record, end
 
 
-@eqx.filter_jit
+@compiled
 def _run(
     laboratory: Laboratory,
     friction: tuple[AbstractHysteresis, ...],

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import InputError
 
 MEMBER = "member"
 FORCE = "force_n"
@@ -185,7 +186,7 @@ def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 class AbstractSingly(AbstractComputation):
-    """Computation member by member; a `ValueError` becomes the member's status."""
+    """Computation member by member; a refusal becomes the member's status."""
 
     @abc.abstractmethod
     def member(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
@@ -198,6 +199,6 @@ class AbstractSingly(AbstractComputation):
             force = None if members.forces is None else members.forces[k]
             try:
                 parts.append(self.member(jax.device_put(model), force, members.seeds[k]))
-            except ValueError as error:
+            except InputError as error:
                 parts.append(with_refused(self, None, {0: refusal(error)}))
         return joined(parts)

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from snrmjax.model.structures import Structure
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.solutions.controlled import damped_normal_mode
 from snrmjax.simulate.solutions.normal_modes import nonlinear_normal_mode

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import (

@@ -13,7 +13,7 @@ from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes, reference_sensor
 from snrmjax.model.structures import Structure
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.virtual_test.phase_resonance_test import phase_resonance_test
 from snrmjax.simulate.virtual_test.recording import NO_ERRORS, MeasurementErrors, Recording
 from snrmjax.study.computations.base import (

@@ -15,7 +15,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.solutions.periodic_motion import periodic_motion

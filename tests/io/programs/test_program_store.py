@@ -18,7 +18,7 @@ from snrmjax.io.programs import program_store
 from snrmjax.io.programs.program_store import key_of, version_of
 from snrmjax.model.modes import linear_response
 from snrmjax.model.structures import Structure, linear_terms_of
-from snrmjax.numerics.kept_programs import NotKept
+from snrmjax.numerics.compiled import NotKept
 
 linear_terms = linear_terms_of.__wrapped__
 response = linear_response.__wrapped__

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.numerics.units import HERTZ
 
 pytestmark = pytest.mark.long
 

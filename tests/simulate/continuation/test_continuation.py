@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from snrmjax.numerics.newton import correct, solve_appended
 from snrmjax.simulate.continuation.continuation import (
     CurveRange,
     CurveStatus,
@@ -15,7 +16,6 @@ from snrmjax.simulate.continuation.continuation import (
     trace_curve,
 )
 from snrmjax.simulate.continuation.event_location import EventSearch
-from snrmjax.simulate.continuation.newton import correct, solve_appended
 
 STEPS = StepControl()
 

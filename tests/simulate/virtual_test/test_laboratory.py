@@ -163,6 +163,9 @@ def test_impossible_laboratories_are_refused():
     ):
         with pytest.raises(ValueError, match=words):
             Laboratory(structure(*acting), shaker, Instruments(), RATE)
+    at_a_node = sj.model.linear_modes([REST, 3 * REST], [0.01, 0.01], [[1.0, 1.0]], [0.0, 1.0])
+    with pytest.raises(ValueError, match="does not drive the mode of interest"):
+        Laboratory(sj.model.structure(at_a_node), Shaker(), Instruments(), RATE)
     for instruments, words in (
         (Instruments(filter_corner_hz=3000.0), "at most half the sampling rate, 2000 Hz"),
         (Instruments(filter_order=1.5), "a whole number"),

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from snrmjax.io.laboratory.arrays.value_tree import Numbers
 from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import unit_meaning
-from snrmjax.io.units import HERTZ
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 _FREQUENCY = r"(f|fr|freq|frequency|frequenz|hz)"
 _START = rf"{_FREQUENCY}_?(start|min|begin|first|low|lower)|(start|min|first|low)_?{_FREQUENCY}"

@@ -15,10 +15,10 @@ from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference, unit_meaning
 from snrmjax.io.laboratory.printed_times import rate_of_printed_times
 from snrmjax.io.laboratory.uneven_times import odd_step, resampled
-from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
 _SHORTEST = 64  # samples; shorter vectors with a time are a table
 _MOST_CHANNELS = 4096

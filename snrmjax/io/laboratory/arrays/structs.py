@@ -25,8 +25,8 @@ from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, f
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _MOST_ENTRIES = 10_000
 _MOST_NAMED = 6
 _NUMBER = re.compile(r"[0-9]+([.,p_][0-9]+)*")
@@ -362,7 +362,7 @@ def _responses(
         denominator = Channel("", "force", "N") if is_per_force(array.unit) else Channel("")
         contents.responses.append(
             frequency_responses(
-                hertz * _HERTZ,
+                hertz * HERTZ,
                 values,
                 [numerator._replace(name=f"{key}.{k + 1}") for k in range(values.shape[0])],
                 [denominator._replace(name=f"reference {k + 1}") for k in range(values.shape[1])],

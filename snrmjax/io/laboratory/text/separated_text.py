@@ -25,6 +25,7 @@ from snrmjax.io.laboratory.text.fields import (
 from snrmjax.io.laboratory.text.row_units import columns_in_one_unit, without_units
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
 _INSPECTED_LINES = 200  # lines searched for the first row of numbers
 _MOST_COLUMNS = 4096
@@ -121,7 +122,7 @@ def _metadata_above(lines: Sequence[str], separator: str, decimal: str) -> _Tabl
         if quantity is None or quantity <= 0 or meaning.dimension not in ("frequency", "time"):
             continue
         is_rate = meaning.dimension == "frequency"
-        factor = meaning.factor / (2 * np.pi) if is_rate else meaning.factor
+        factor = meaning.factor / HERTZ if is_rate else meaning.factor
         metadata = metadata._replace(rate=quantity * factor, is_rate=is_rate, text=plain)
     return metadata
 

@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from snrmjax.io.laboratory.physical_units import unit_meaning
 from snrmjax.io.laboratory.uff.data_sets import stated
-from snrmjax.io.units import HERTZ
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.units import HERTZ
 
 _SI = {"time": 1.0, "frequency": HERTZ}  # s and Hz
 _OTHERS = {19: "a rotation speed", 20: "an order"}  # specific data types

@@ -23,8 +23,8 @@ from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, f
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
+from snrmjax.numerics.units import HERTZ
 
-_HERTZ = 2 * np.pi
 _MOST_NOTES = 20
 _TIME, _RESPONSE, _COHERENCE = 1, (4, 5), 6
 _Function = Mapping[str, Any]
@@ -226,7 +226,7 @@ def _responses(part: Sequence[_Function], x: np.ndarray, source: _Source) -> Fre
         )
     even = even_abscissa(measured[0])
     return frequency_responses(
-        x * _HERTZ,
+        x * HERTZ,
         values,
         _unique(list(rows)),
         _unique(list(columns)),

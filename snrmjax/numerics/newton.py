@@ -1,4 +1,9 @@
-"""Newton's method in a hyperplane, one step at a time, for one problem or a batch."""
+"""Newton's method, with its tolerances: to a root, and onto a curve.
+
+`newton` solves as many equations as unknowns, each of order one (or over their `scale`). On a curve
+one equation is missing: `correct` solves for its point in a hyperplane, and `Trial` takes single
+steps, so that many curves advance in lanes; one factorisation then yields the tangent too.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -39,6 +44,53 @@ def _solve_appended_batch(count: int, batched: list[bool], columns: Array) -> tu
     if on_accelerator():
         return jax.vmap(solve_appended.fun)(columns), True
     return jax.lax.map(solve_appended, columns), True
+
+
+CLOSE = 1e-6  # change after which one more step is exact to rounding
+ROUNDING = 1e-9  # largest further step at a root that is known to all its digits
+
+
+class Root(NamedTuple):
+    """Where Newton's method ended, and the equations there."""
+
+    point: Point
+    residual: Float[Array, " unknown"]
+    jacobian: Float[Array, "unknown unknown"]
+    change: Float[Array, ""]  # largest entry of the last step over the scale
+    n_steps: Int[Array, ""]
+    scale: Number
+
+    def one_more(
+        self, residual: Float[Array, " unknown"] | None = None, within: float = CLOSE
+    ) -> tuple[Point, Bool[Array, ""]]:
+        """The point after a further step, and whether the iteration converged `within` it.
+
+        With a differentiable `residual` at the point the step carries its first derivatives.
+        """
+        step = jnp.linalg.solve(self.jacobian, self.residual if residual is None else residual)
+        largest = jnp.max(jnp.abs(jax.lax.stop_gradient(step) / self.scale))
+        return self.point - step, (self.change <= CLOSE) & (largest <= within)
+
+
+def newton(linearised: Linearised, start: Point, *, most: int = 20, scale: Number = 1.0) -> Root:
+    """Newton's method from `start` until a step changes no unknown by more than `CLOSE`.
+
+    Arguments: `linearised` returns equations and Jacobian; `most` steps; `scale` of the unknowns.
+    The result ends one step early: `Root.one_more` takes it, by the Jacobian already known.
+    """
+
+    def step(last: Root) -> Root:
+        change = jnp.linalg.solve(last.jacobian, last.residual)
+        point, size = last.point - change, jnp.max(jnp.abs(change / scale))
+        return Root(point, *linearised(point), size, last.n_steps + 1, scale)
+
+    def goes_on(last: Root) -> Array:
+        return (last.n_steps < 1) | ((last.n_steps < most) & (last.change > CLOSE))
+
+    # The first step is zero, so that the equations are compiled only once.
+    nothing, eye = jnp.zeros_like(start), jnp.eye(start.shape[0])
+    first = Root(start, nothing, eye, jnp.array(jnp.inf), jnp.array(-1), scale)
+    return jax.lax.while_loop(goes_on, step, first)
 
 
 class Trial(NamedTuple):
@@ -91,8 +143,8 @@ def correct(
     linearised: Linearised,
     start: Point,
     direction: Point,
-    tolerance: Number,
-    iterations: Number,
+    tolerance: Number = 1e-10,
+    iterations: Number = 30,
 ) -> Trial:
     """Newton's method in the hyperplane through `start` normal to `direction`."""
     return jax.lax.while_loop(
