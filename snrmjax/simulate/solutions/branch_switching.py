@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from snrmjax.numerics.blocks import as_arrays, taken
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.newton import Trial, correct
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import (
     CurveEvent,
@@ -22,7 +23,6 @@ from snrmjax.simulate.continuation.continuation import (
     TracedCurve,
 )
 from snrmjax.simulate.continuation.curve_tracing import lies_on, trace_both_ways
-from snrmjax.simulate.continuation.newton import Trial, correct
 from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, assembled
 
 _MOST_CURVES = 16  # of one member; branches of branches end there
