@@ -98,8 +98,8 @@ def _level_errors_with(
     scale = np.array([prior.scale for prior in LEVELS])
     relative = (problem.readings.level_std / scale)[free]
 
-    def log_prior(logs: np.ndarray) -> float:  # of `ScaleFreePrior`
-        return -0.5 * float(np.sum((relative * np.exp(logs)) ** 2 - relative**2))
+    def log_prior(logs: np.ndarray) -> float:
+        return float(np.sum(logs) - 0.5 * np.sum((relative * np.exp(logs)) ** 2 - relative**2))
 
     def stds(logs: np.ndarray) -> LevelStds:
         values = np.ones(4)
