@@ -195,7 +195,7 @@ class IdentifyOptions:
     )
     robust: bool = option(
         False,
-        "Give outlying states less weight, also where normal noise is the more probable one.",
+        "Give outlying states less weight.",
         panel=_JOINT,
         needs=_FIT,
         why_needed="belongs to a joint fit: add `--fit auto`",

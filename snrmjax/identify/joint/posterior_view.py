@@ -20,13 +20,13 @@ from snrmjax.identify.joint.force_balance import (
     Unknowns,
     velocity_of_others,
 )
-from snrmjax.identify.joint.notes import NoiseEstimate, farthest_by_chance
+from snrmjax.identify.joint.notes import NoiseEstimate
 from snrmjax.identify.test_model.balance import off_resonance
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
 from snrmjax.identify.test_model.curve_terms import CurveTerms
 from snrmjax.identify.test_model.gauss_newton import Rounds
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE, WITH_FREQUENCY
-from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
+from snrmjax.identify.test_model.posterior import TestPosterior, fit_test, students_factor
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.numerics.rules import InputError
@@ -57,7 +57,7 @@ def view_of(
     free: tuple[str, ...],
     stated: bool,
     *,
-    robust: bool | None,
+    robust: bool,
     knots: int | None = None,
 ) -> View:
     """The posterior of a joint fit's states, with curves of the chosen families.
@@ -68,9 +68,8 @@ def view_of(
     the model's, unless the states contradict it, which those at a controlled phase cannot;
     frequency scatter is added to every state's errors where the states show it.
 
-    Arguments: `free` the unknown instrument errors; `stated` whether the noise is; `robust` whether
-    it has outliers (Student's t), None: where that is more probable; `knots` the largest number of
-    each curve.
+    Arguments: `free` the unknown instrument errors; `stated` whether the noise is; `knots` the
+    largest number of each curve.
     """
     guess = _complex_gain(problem) if {"force_gain", "instrument_phase"} & set(free) else 1.0 + 0j
     gain = abs(guess) if "force_gain" in free else 1.0
@@ -78,14 +77,9 @@ def view_of(
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     states = _test_states(problem, free, stated, guess)
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
-    fit = functools.partial(fit_test, robust=bool(robust), power_likelihood=True)
+    fit = functools.partial(fit_test, robust=robust, power_likelihood=True)
     first = functools.partial(fit, compare_levels=False, parts_of_noise=True)
     posterior = first(states, rounds=rounds)
-    if robust is None and _has_outliers(posterior):
-        tails = first(states, rounds=rounds, robust=True)
-        if tails.log_evidence > posterior.log_evidence:
-            posterior = tails
-            fit, first = (functools.partial(one, robust=True) for one in (fit, first))
     if _noise_of(posterior, stated).exceeded:  # the curves may be steeper than the knots resolve
         posterior = first(states, rounds=rounds._replace(crowded=True))
     mass, std = posterior.modal_mass
@@ -120,8 +114,13 @@ def view_of(
         scale * posterior.states.errors,
         posterior.corrections,
     )
+    new_level = np.where(
+        np.array(states.level_std) > 0,
+        states.level_std,
+        students_factor(states.n_levels - 1) * noise.level_std,
+    )
     ratio = posterior.level_std / noise.level_std
-    of_levels = map(jax.device_put, (posterior.level_std, ratio, posterior.level_std))
+    of_levels = map(jax.device_put, (posterior.level_std, ratio, new_level))
     z = 1j * states.frequency * states.constant * states.force / states.velocity
     problem = dataclasses.replace(
         problem.with_data(
@@ -137,13 +136,6 @@ def view_of(
     )
     posterior = posterior._replace(covariance=wider**2 * posterior.covariance)
     return View(posterior, problem, guess, free, noise)
-
-
-def _has_outliers(posterior: TestPosterior) -> bool:
-    """Whether a residual exceeds what is expected of so many states."""
-    return bool(
-        np.max(np.hypot(*posterior.residuals.T)) > farthest_by_chance(len(posterior.residuals))
-    )
 
 
 def _with_common_gain_in_the_force(posterior: TestPosterior) -> TestPosterior:

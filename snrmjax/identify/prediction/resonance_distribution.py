@@ -129,7 +129,7 @@ def resonance_distribution(
         total = recorded * np.abs(of_mode + other(np.where(known, at, np.nanmedian(at))))
         quantiles = np.quantile([at[known], total[known]], QUANTILES, axis=1).T
     return ResonanceDistribution(
-        force=float(force),
+        force=force,
         drive=new.drive,
         largest_amplitude_ratio=ratio,
         probability=float(known.sum() / max(kept.sum(), 1)),

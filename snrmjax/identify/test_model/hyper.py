@@ -13,9 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import PchipInterpolator
-from scipy.optimize import brentq
-from scipy.special import ndtr, ndtri
 
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.curve_terms import CurveTerms
@@ -32,9 +29,6 @@ _SMALLEST_STD = 1e-4  # of a prior's scale: lower bound of a 1σ
 _FARTHEST = 5.0  # 1σ: bound of the variation of the roughness
 _MOST = 0.5  # upper bound of 1σ of level errors, relative or rad: more is another structure
 _LEAST = 4.0  # nats below the most likely grid point: points below are not expanded
-_ON_A_GRID, _FINE = 12, 240  # points of ln 1σ between its bounds, and interpolated ones
-_ABOUT_MODE = np.linspace(-1.5, 2.5, 11)  # further points
-_TAIL = 0.025  # on each side of a 95 % interval
 ALONG = 14  # basis functions of a discrepancy, for each of the two parts
 
 
@@ -281,37 +275,6 @@ def averaged(
     return point, Gaussian(
         mean, within + (offset * weight[:, None]).T @ offset, effective, level_std
     )
-
-
-def expected_level_std(
-    objective: Objective, point: Float[np.ndarray, " hyper"], bounds: list[tuple[float, float]]
-) -> Float[np.ndarray, " error"]:
-    """1σ of a normal level error with the same 95 % interval as an error of unknown 1σ.
-
-    The posterior of each unstated 1σ is integrated, with the other hyperparameters at their mode:
-    few levels leave it uncertain (as Student's t), and small errors its order of magnitude.
-    """
-    std = np.exp(point[LEVELS])
-    for k in range(len(std)):
-        low, high = bounds[LEVELS.start + k]
-        if not high > low:
-            continue
-        about = np.clip(point[LEVELS.start + k] + _ABOUT_MODE, low, high)
-        log_std = np.unique([*np.linspace(low, high, _ON_A_GRID), *about])
-        trials = np.repeat(point[None], len(log_std), axis=0)
-        trials[:, LEVELS.start + k] = log_std
-        log_p = np.array([objective(trial)[0] for trial in trials])
-        # Cubic between points, without overshooting: few of them then do.
-        fine = np.linspace(low, high, _FINE)
-        weight, each = np.exp(PchipInterpolator(log_std, log_p - log_p.max())(fine)), np.exp(fine)
-        weight = weight / weight.sum()
-
-        def outside(bound: float, weight: np.ndarray = weight, std: np.ndarray = each) -> float:
-            return float(weight @ ndtr(-bound / std)) - _TAIL
-
-        reach = -ndtri(_TAIL)
-        std[k] = brentq(outside, reach * each[0], reach * each[-1], xtol=1e-12) / reach
-    return std
 
 
 def remainders(

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import fdtrc
+from scipy.special import fdtrc, ndtri, stdtrit
 
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.balance import Balance
@@ -43,7 +43,6 @@ from snrmjax.identify.test_model.hyper import (
     averaged,
     bounds_of,
     differing_levels,
-    expected_level_std,
     hyper_at,
     layout_of,
     objective_of,
@@ -263,46 +262,50 @@ def fit_test(
     best = solver.best
     if best is None:
         raise InputError(f"`rounds.most` must be at least one, not {rounds.most}.")
-    # The mean error of the levels is not projected out here: states off resonance determine it. A
-    # part correlated with force is attributed to the curves, but the bands allow for it as a level
-    # error (`exchanged`).
+    # 1σ of level errors from few levels is uncertain: widened as Student's t. Their mean, and a
+    # part correlated with force, are attributed to the curves, but the bands allow for them as
+    # level errors (`exchanged`).
     last = solver.balance.linearised(best.mean, best.errors, apart=False)
-    fraction = best.equations.fraction * (priors.STUDENT_INFORMATION if robust else 1.0)
-    equations = last.equations._replace(fraction=fraction)
+    equations = last.equations._replace(fraction=best.equations.fraction)
     exchanged = equations
     if any(solver.balance.in_order):
         free = solver.balance._replace(in_order=(False,) * 4)
         anew = free.linearised(best.mean, best.errors, apart=False)
-        exchanged = anew.equations._replace(fraction=fraction)
+        exchanged = anew.equations._replace(fraction=equations.fraction)
 
     variances = prior_variances(terms, layout, states)
-    objective = objective_of(best.equations, states, terms, layout)
-    bounds = bounds_of(states, terms, best.point)
 
     def gaussian(point: np.ndarray) -> Gaussian:
         noise, variance = np.exp(point[NOISE]), variances(point)
-        mean, covariance = equations.posterior(noise, variance)
+        # The mean has no common level error: the roughness prior would shrink the curves and shift
+        # the rest to the levels.
+        mean = best.equations.posterior(noise, variance)[0]
+        covariance = equations.posterior(noise, variance)[1]
         known = variance > 0
         informed = np.zeros_like(variance)  # per unknown, after what curves absorb
         informed[known] = 1 - np.diag(covariance)[known] / variance[known]
-        variance[layout.levels] = expected_level_std(objective, point, bounds) ** 2
+        for errors_of_kind, std in zip(layout.levels.T, states.level_std, strict=True):
+            variance[errors_of_kind] *= (
+                1.0 if std > 0 else students_factor(float(np.sum(informed[errors_of_kind]))) ** 2
+            )
         wide = exchanged.posterior(noise, variance)[1]
         return Gaussian(mean, wide, float(np.sum(informed)), np.sqrt(variance[layout.levels[0]]))
 
+    objective = objective_of(best.equations, states, terms, layout)
+    bounds = bounds_of(states, terms, best.point)
     point, summary = best.point, gaussian(best.point)
     if average_roughness:
         grid = roughness_grid(objective, best.point, bounds)
         point, summary = averaged(grid, gaussian)
     flat = objective_of(best.equations, states, terms, layout, flat=True)
-    tails = _log_tails(best.residuals, solver.balance.weight) if robust else 0.0
     posterior = TestPosterior(
         states,
         terms,
         summary.mean,
         summary.covariance,
         hyper_at(point, terms),
-        laplace_evidence(objective, best.point, bounds) + tails,
-        _log_likelihood(best) + tails,
+        laplace_evidence(objective, best.point, bounds),
+        _log_likelihood(best),
         best.errors,
         best.residuals * np.exp(best.point[NOISE] - point[NOISE]),
         summary.effective_unknowns,
@@ -388,14 +391,9 @@ def _log_likelihood(best: Iterate) -> float:
     return best.equations.offset - 0.5 * float(np.sum(residuals**2) + residuals.size * each)
 
 
-def _log_tails(
-    residuals: Float[np.ndarray, "state part"], weight: Float[np.ndarray, " state"]
-) -> float:
-    """ln of Student's t over the weighted normal density that stands for it, at the residuals.
+def students_factor(freedom: float) -> float:
+    """Ratio of Student's t to the normal 97.5 % quantile: widening of a 95 % band.
 
-    Reference: for the weights of the bivariate distribution, Lange, Little & Taylor, J. Am. Stat.
-    Assoc. 84 (1989) 881, doi:10.1080/01621459.1989.10478852.
+    At least two degrees of freedom: with one the band would be useless.
     """
-    freedom, square = priors.STUDENT_FREEDOM, np.sum(residuals**2, axis=1)
-    tail = 0.5 * (freedom + 2) * np.log1p(square / (weight * freedom))
-    return float(np.sum(0.5 * square - np.log(weight) - tail))
+    return float(stdtrit(max(freedom, 2), 0.975) / ndtri(0.975))

@@ -26,14 +26,6 @@ class HalfNormalPrior(NamedTuple):
     scale: float
 
 
-class ScaleFreePrior(NamedTuple):
-    """A positive number whose logarithm is uniform up to a scale, beyond which it falls off as a
-    half-normal one.
-    """
-
-    scale: float
-
-
 class NormalPrior(NamedTuple):
     """A normal number of mean zero."""
 
@@ -47,7 +39,7 @@ class LogUniformPrior(NamedTuple):
     high: float
 
 
-Density = LogNormalPrior | HalfNormalPrior | ScaleFreePrior | NormalPrior | LogUniformPrior
+Density = LogNormalPrior | HalfNormalPrior | NormalPrior | LogUniformPrior
 
 
 class JointDensity(NamedTuple):
@@ -58,7 +50,6 @@ class JointDensity(NamedTuple):
     std: Float[np.ndarray, " normal"]
     half: Int[np.ndarray, " half"]  # indices of logarithms of half-normal numbers
     scale: Float[np.ndarray, " half"]  # their logarithms
-    per_number: Float[np.ndarray, " half"]  # 1 for a density of the number, 0 for its logarithm's
     constant: float
 
     @classmethod
@@ -68,10 +59,8 @@ class JointDensity(NamedTuple):
         constant = 0.0
         for index, density in enumerate(densities):
             if isinstance(density, HalfNormalPrior):
-                half.append((index, np.log(density.scale), 1))
+                half.append((index, np.log(density.scale)))
                 constant += np.log(2) - _LOG_ROOT
-            elif isinstance(density, ScaleFreePrior):
-                half.append((index, np.log(density.scale), 0))
             elif isinstance(density, LogUniformPrior):
                 constant -= np.log(density.high - density.low)
             elif density is not None:
@@ -82,14 +71,13 @@ class JointDensity(NamedTuple):
                 )
                 normal.append((index, *pair))
                 constant -= np.log(pair[1]) + _LOG_ROOT
-        first, second = (np.array(rows).reshape(-1, k) for rows, k in ((normal, 3), (half, 3)))
+        first, second = (np.array(rows).reshape(-1, k) for rows, k in ((normal, 3), (half, 2)))
         return cls(
             first[:, 0].astype(int),
             first[:, 1],
             first[:, 2],
             second[:, 0].astype(int),
             second[:, 1],
-            second[:, 2],
             float(constant),
         )
 
@@ -101,8 +89,8 @@ class JointDensity(NamedTuple):
         step = (point[self.normal] - self.mean) / self.std
         off = point[self.half] - self.scale
         square = np.exp(2 * off)
-        slopes[self.normal], slopes[self.half] = -step / self.std, self.per_number - square
-        value = -0.5 * float(step @ step) + float(off @ self.per_number - 0.5 * square.sum())
+        slopes[self.normal], slopes[self.half] = -step / self.std, 1 - square
+        value = -0.5 * float(step @ step) + float(off.sum() - 0.5 * square.sum())
         return value + self.constant, slopes
 
 
@@ -117,17 +105,17 @@ manual readings some 3 %."""
 FORCE_TO_VELOCITY = 0.1
 """Unstated error of the force over that of the velocity: calibrated load cells."""
 
-LEVEL_GAIN = ScaleFreePrior(0.05)
+LEVEL_GAIN = HalfNormalPrior(0.05)
 """Relative: drift of conditioners and of a shaker's coupling between levels; published tests show
 15 %."""
 
-LEVEL_PHASE = ScaleFreePrior(0.02)
+LEVEL_PHASE = HalfNormalPrior(0.02)
 """rad: 1.1°, drift of a filter or controller between levels; manually run tests show 3°."""
 
-LEVEL_STIFFNESS = ScaleFreePrior(0.008)
+LEVEL_STIFFNESS = HalfNormalPrior(0.008)
 """Relative, of ω̃²: 0.4 % of frequency, as 20 K in metals or the reseating of a joint."""
 
-LEVEL_DAMPING = ScaleFreePrior(0.05)
+LEVEL_DAMPING = HalfNormalPrior(0.05)
 """Relative: joints and clamps reopened between levels repeat to some 10 %."""
 
 NEAR_LINEAR = (0.5, 1.5)
@@ -144,7 +132,7 @@ curve of amplitude alone lacks. Damping: −1 for dry friction and hysteresis, 1
 stiffness: 0 where harmonics are small, 0.75 on an arch, which its static and second harmonic
 soften."""
 
-LEVELS: tuple[ScaleFreePrior, ...] = (
+LEVELS: tuple[HalfNormalPrior, ...] = (
     LEVEL_GAIN,
     LEVEL_PHASE,
     LEVEL_STIFFNESS,
@@ -200,9 +188,6 @@ DISCREPANCY_LENGTH = np.radians(30.0)
 
 STUDENT_FREEDOM = 4.0
 """Student's t degrees of freedom of noise with outliers: one state in 20 lies beyond 3σ."""
-
-STUDENT_INFORMATION = (STUDENT_FREEDOM + 2) / (STUDENT_FREEDOM + 4)
-"""Fisher information of the bivariate distribution over that of the normal ones of its weights."""
 
 LEAST_FRACTION = 0.1
 """Lower bound of the independent fraction of the states: while curves are far off it is too low."""
