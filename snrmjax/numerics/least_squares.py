@@ -14,4 +14,6 @@ def root_of_inverse(jacobian: np.ndarray) -> np.ndarray:
     norm = np.linalg.norm(jacobian, axis=0)
     norm = np.where(norm > 0, norm, 1.0)
     _, values, rows = np.linalg.svd(jacobian / norm, full_matrices=False)
+    # Smaller ones are rounding; an exact zero would end in a division by it.
+    values = np.maximum(values, np.finfo(float).eps * np.max(values, initial=0.0))
     return (rows.T / values) / norm[:, None]
