@@ -14,7 +14,7 @@ from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.least_squares import inverse_of
+from snrmjax.numerics.least_squares import root_of_inverse
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
 from snrmjax.numerics.result import Variable, quantity
 from snrmjax.numerics.rules import InputError
@@ -236,14 +236,15 @@ def _outcome(
     linear, n = end.linearised, len(sigma)
     reduced = end.sum_of_squares / freedom if freedom > 0 else np.nan
     finite = bool(np.all(np.isfinite(linear.jacobian)))
-    covariance, notes = np.full((len(names),) * 2, np.nan), []
+    root, notes = np.full((len(names),) * 2, np.nan), []
+    relative = root
     if finite:
-        relative = inverse_of(linear.jacobian)
+        root = root_of_inverse(linear.jacobian)
         margin = 3 * np.sqrt(2 / max(freedom, 1))
         stated = points.frequency_std is not None
         if freedom > 0 and (not stated or reduced > 1 + margin):
-            relative = relative * reduced
-        covariance = relative * values * values[:, None]
+            root = root * np.sqrt(reduced)
+        relative = root @ root.T
         if stated and reduced > 1 + margin:
             notes.append(Fact("calibration_noise", scale=float(np.sqrt(reduced))))
         vague = ~(np.diag(relative) < 1)
@@ -256,15 +257,13 @@ def _outcome(
     at_limit = np.abs(np.abs(end.point) - _LARGEST_LOG_CHANGE) < 1e-9
     if at_limit.any():
         notes.append(Fact("parameters_at_limit", **_of_parameters(names, at_limit, prior)))
-    by_value = linear.jacobian[:n] * sigma[:, None] / values
-    variance = np.einsum("ki,ij,kj->k", by_value, covariance, by_value)
     return BackboneCalibration(
         model=model_of(dict(zip(names, values.tolist(), strict=True))),
         values=values,
-        covariance=covariance,
+        covariance=relative * values * values[:, None],
         measured=points,
         fitted=linear.frequency,
-        fitted_std=np.sqrt(variance),
+        fitted_std=np.linalg.norm(linear.jacobian[:n] @ root, axis=1) * sigma,
         residuals=-linear.residuals[:n],
         reduced_chi_square=float(reduced),
         names=names,
