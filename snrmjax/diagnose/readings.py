@@ -20,8 +20,8 @@ from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.effect_metadata import MotionScales
 
-_AMPLITUDES = (-0.32, -0.16, 0.0, 0.16, 0.32)
-"""ln of amplitudes over the measured ones: gain errors from −27 to 38 %."""
+_AMPLITUDES = (-0.66, -0.32, -0.16, 0.0, 0.16, 0.32, 0.66)
+"""ln of amplitudes over the measured ones: gain errors from −48 to 93 %."""
 
 
 class ModelMotion(NamedTuple):

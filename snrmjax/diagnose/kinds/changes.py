@@ -24,7 +24,7 @@ SLIPS = np.linspace(np.log(0.02), np.log(0.95), 47)  # ln, over the largest ampl
 EXPONENTS = np.linspace(1.1, 2.9, 10)
 DETUNINGS = np.linspace(-0.04, 0.04, 9)
 APART = np.array([-0.3, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.3])  # of a close mode, over ω₀
-MOTION_GAINS = np.linspace(-0.24, 0.24, 8)  # at the largest amplitude
+MOTION_GAINS = np.linspace(-0.44, 0.76, 16)  # at the largest amplitude
 DAMPINGS = np.log([0.5, 2.0])  # ln, of a further mode, over the mode's own
 
 _ITERATIONS = 40  # each of which reduces the error of such a gain by a factor of two or more
@@ -201,7 +201,7 @@ def _smooth(x: np.ndarray, values: np.ndarray, weight: np.ndarray) -> tuple[np.n
 
 
 def _per_gain(r: Readings, change: np.ndarray, gain: float) -> np.ndarray:
-    return change * priors.GAIN / (gain * r.natural_frequency**2)
+    return change * (priors.GAIN / (gain * r.natural_frequency**2))
 
 
 def shape_change(r: Readings, strength: float, _: float) -> tuple[float]:

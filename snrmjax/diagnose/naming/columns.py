@@ -18,6 +18,7 @@ from snrmjax.model.effects import EFFECTS, is_own, make_effect
 from snrmjax.numerics.compiled import compiled
 
 _SAMPLES, _AMPLITUDES = 256, 60  # for a user's own force
+_NO_STRENGTH = 1e-6  # shape below which a change is that of any small strength
 _PARTS = 3  # of a shape's interval, when refined
 
 
@@ -47,6 +48,14 @@ class Column(NamedTuple):
             parts += _column(readings, self.kind, shape, self.fraction / _PARTS**n, widths)
         return parts
 
+    def exact_at(self, readings: Readings, strength: float) -> "Column":
+        """The column with the change exact for a strength within its limits, where that matters."""
+        value = float(np.clip(strength, *self.limits)) * (hypothesis_of(self.kind).unit or 0.0)
+        if abs(value) < _NO_STRENGTH:
+            return self
+        found = _column(readings, self.kind, (value,), self.fraction, ())
+        return found[0]._replace(limits=self.limits) if found else self
+
 
 def hypothesis_columns(readings: Readings, kinds: Iterable[str]) -> list[Column]:
     """The columns of some kinds of effects; kinds without columns are left out."""
@@ -55,6 +64,9 @@ def hypothesis_columns(readings: Readings, kinds: Iterable[str]) -> list[Column]
         law = hypothesis_of(kind)
         if law.change is None:
             columns += _of_own_force(readings, kind)
+            continue
+        if law.unit is not None:
+            columns += _by_strength(readings, kind, law.axes[0], law.unit)
             continue
         axes, choices = law.axes, law.choices if readings.harmonics else law.choices[:1]
         intervals = [np.gradient(axis) for axis in axes]
@@ -66,6 +78,17 @@ def hypothesis_columns(readings: Readings, kinds: Iterable[str]) -> list[Column]
             for last in ((choice,) for choice in choices) if choices else ((),):
                 columns += _column(readings, kind, (*shape, *last), fraction, widths)
     return columns
+
+
+def _by_strength(readings: Readings, kind: str, axis: np.ndarray, unit: float) -> list[Column]:
+    """Columns that are exact for a strength each, and stand for those nearest to it."""
+    middles = (axis[:-1] + axis[1:]) / (2 * unit)
+    limits = itertools.pairwise([-np.inf, *map(float, middles), np.inf])
+    return [
+        column._replace(limits=between)
+        for value, between in zip(axis, limits, strict=True)
+        for column in _column(readings, kind, (float(value),), 1.0, ())
+    ]
 
 
 def _of_own_force(readings: Readings, kind: str) -> list[Column]:
@@ -119,9 +142,6 @@ def _column(
             higher[index] = law.higher(readings, one, *shape)
     shapes = {"shape": tuple(map(float, shape)), "widths": tuple(map(float, widths))}
     limits = (-np.inf if law.sign <= 0 else 0.0, np.inf if law.sign >= 0 else 0.0)
-    if law.unit is not None:  # the shape is the strength for which the change is exact
-        low, high = shape[0] - widths[0] / 2, shape[0] + widths[0] / 2
-        limits, fraction = (float(low / law.unit), float(high / law.unit)), 1.0
     return _scaled(kind, change, higher, fraction=fraction, limits=limits, std=law.std, **shapes)
 
 

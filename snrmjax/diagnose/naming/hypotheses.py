@@ -15,6 +15,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from snrmjax.diagnose import priors
+from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.naming.columns import Column, hypothesis_columns
 from snrmjax.diagnose.naming.evidence import HarmonicSums, LawSums, remainder_stds
 from snrmjax.diagnose.naming.rows import (
@@ -25,6 +26,7 @@ from snrmjax.diagnose.naming.rows import (
     RemainderStds,
     RowBlock,
     problem_of,
+    solved,
 )
 from snrmjax.diagnose.readings import Readings
 from snrmjax.identify.test_model.priors import LEVELS
@@ -46,6 +48,7 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
     problem = _with_likeliest_length(readings, hypothesis_columns(readings, kinds))
     for _ in range(_ROUNDS):
         cells, alone = _compared(problem, 2, _REACH)
+        problem = _exact_at_strengths(problem, cells)
         counts = _worth_dividing(problem, cells, alone)
         if not counts:
             break
@@ -59,6 +62,22 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
     if with_laws is problem:
         return problem, cells
     return with_laws, hypotheses_of(with_laws)
+
+
+def _exact_at_strengths(problem: Problem, cells: list[Cell]) -> Problem:
+    """The problem with columns exact for their strengths in the best hypothesis with each."""
+    best: dict[int, Cell] = {}
+    for cell in cells:
+        for k in cell.columns:
+            if hypothesis_of(problem.columns[k].kind).unit is not None:
+                best.setdefault(k, cell)
+    if not best:
+        return problem
+    columns = list(problem.columns)
+    for k, cell in best.items():
+        strength = float(solved(problem, cell).mean[cell.columns.index(k)])
+        columns[k] = columns[k].exact_at(problem.readings, strength)
+    return problem.with_columns(columns)
 
 
 def _with_level_errors_of_laws(problem: Problem, cells: list[Cell]) -> Problem:

@@ -53,7 +53,7 @@ def _parts(field: str) -> tuple[str, str] | None:
     try:
         if level_reference(match[2]) is None:
             unit_meaning(match[2])
-    except ValueError:
+    except InputError:
         return None
     return match[1], match[2]
 
@@ -101,7 +101,7 @@ def _factors(
     )
     try:
         meanings = {word: unit_meaning(word) for word in (words[0], *others)}
-    except ValueError as error:
+    except InputError as error:
         raise InputError(different) from error
     if not all(words) or len({meaning._replace(factor=1.0) for meaning in meanings.values()}) > 1:
         raise InputError(different)
