@@ -50,11 +50,12 @@ def static_displacement(
             predicted = before - jnp.linalg.solve(tangent(before), balance(before, load))
             size = jnp.max(jnp.abs(load) / squared)
             root = newton(partial(linearised, f=load), predicted, most=_ITERATIONS, scale=size)
-            q = root.one_more()[0]
+            q, solved = root.one_more()
             scaled = tangent(q) / jnp.sqrt(squared[:, None] * squared)
             moved, expected = (jnp.linalg.norm((x - before) * frequency) for x in (q, predicted))
             # A step much longer than the tangent prediction has jumped to another path.
-            good = good & (jnp.linalg.eigvalsh(scaled)[0] > 0) & (moved <= _JUMP * expected)
+            is_stable = jnp.linalg.eigvalsh(scaled)[0] > 0
+            good = good & solved & is_stable & (moved <= _JUMP * expected)
             return (q, good), None
 
         fractions = jnp.arange(1, _STEPS + 1) / _STEPS

@@ -140,7 +140,7 @@ def changed(matrix, entry, value):
         ((M, C, K), {"n_modes": 0}, r"`n_modes` must lie between 1 and 2"),
         ((M, C, K), {"n_modes": 3}, r"`n_modes` must lie between 1 and 2"),
         ((M, C, K), {"mode_of_interest": 2}, r"`mode_of_interest` must lie between 0 and 1"),
-        ((M, C, K * 0), {}, r"excites no mode"),
+        ((M, C, K * 0), {}, r"`stiffness` is zero for every motion"),
     ],
 )
 def test_what_is_no_structure_is_refused(parts, settings, message):
