@@ -325,7 +325,7 @@ def fit_jointly(
     require_passive(
         released,
         float(fit.problem.modal_constant / mass),
-        np.asarray(curve(fit.motion().amplitude(curve))),
+        curve.linearised(np.asarray(fit.motion().amplitude(curve))).value,
     )
     named = any(choice.kind != SmoothingSpline.kind for choice in choices)
     notes += _notes(fit, posterior.frequency_scatter, level_std, named)
