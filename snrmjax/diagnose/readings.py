@@ -175,7 +175,11 @@ def readings_of(
     # Curves may depend on the forcing frequency too.
     states = states._replace(off_resonance_std=OFF_RESONANCE)
     posterior = fit_test(
-        states, compare_levels=False, power_likelihood=phases_known, parts_of_noise=phases_known
+        states,
+        robust=None,
+        compare_levels=False,
+        power_likelihood=phases_known,
+        parts_of_noise=phases_known,
     )
     states = posterior.states
     balance = Balance(

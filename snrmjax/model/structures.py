@@ -432,16 +432,25 @@ def displacement_scale(model: Structure) -> np.ndarray:
 
 def _scale_of_elements(model: Structure, squared: np.ndarray) -> np.ndarray:
     """The displacement of each mode at which memoryless effects change its force by a tenth."""
-    elements = elements_of(model.memoryless, model.modes)
-    influence, grid = np.asarray(elements.influence), np.logspace(-12, 3, 601)
-    q = np.concatenate([[0.0], grid, -grid])
+    grid = np.logspace(-12, 3, 601)
+    forces = np.asarray(_along_modes(model, np.concatenate([[0.0], grid, -grid])))
     scale = np.full(model.n_modes, np.nan)
-    for mode in np.flatnonzero(np.any(influence, axis=0)):
-        x = jnp.asarray(q[:, None] * influence[:, mode])
-        values = np.asarray(elements.force(x, jnp.zeros_like(x))) @ influence[:, mode]
+    for mode, values in enumerate(forces):
         change = np.abs(values[1:] - values[0]).reshape(2, -1).max(axis=0)
         reached = change > 0.1 * squared[mode] * grid
         # The relative effect of a bilinear stiffness is amplitude-independent and sets no scale.
         if reached.any() and not reached[0]:
             scale[mode] = grid[np.argmax(reached)]
     return scale
+
+
+@compiled
+def _along_modes(model: Structure, q: Float[Array, " point"]) -> Float[Array, "mode point"]:
+    """Static modal forces of the memoryless elements on each mode that moves alone."""
+    elements = elements_of(model.memoryless, model.modes)
+
+    def along(influence: Array) -> Array:
+        x = q[:, None] * influence
+        return elements.force(x, jnp.zeros_like(x)) @ influence
+
+    return jax.vmap(along, 1)(elements.influence)

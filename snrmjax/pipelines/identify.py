@@ -20,7 +20,7 @@ from snrmjax.identify.inference.identification import (
 )
 from snrmjax.identify.inference.optimal_design import NextMeasurements, next_measurements
 from snrmjax.identify.joint.joint_fit import JointFit, corrected_states, fit_jointly
-from snrmjax.identify.joint.notes import note_on_outlying, outlying_states
+from snrmjax.identify.joint.notes import note_on_outlying
 from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
 from snrmjax.identify.prediction.resonance_distribution import notes_on_negative_damping
@@ -175,10 +175,7 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
         free=[name for several in options.free for name in several.split(",")],
     )
     _log.info("fits backbone and damping curves to %d states", len(data.frequency))
-    fit = fitted(robust=options.robust)
-    # Outliers may distort the curves so that other states deviate: a robust fit identifies them.
-    robust_fit = fit if options.robust or not outlying_states(fit).size else fitted(robust=True)
-    outlying = note_on_outlying(robust_fit, robust=options.robust)
+    fit = fitted(robust=options.robust or None)
     data = corrected_states(data, fit)
     identification = identification_of_fit(data, fit)
     predictions, trends = predictions_of_fit(fit, options)
@@ -189,7 +186,7 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
     notes = (
         *caveats,
         *data.notes,
-        *outlying,
+        *note_on_outlying(fit),
         *identification.notes,
         *linear_damping_note(fit, model),
         *_note_on_gain(fit),

@@ -325,10 +325,7 @@ def _identified(data: SteadyStates, model: Structure) -> tuple[IdentifiedTest, t
     drive_only = not np.isfinite(np.asarray(data.force)).any()
     free = ("instrument_phase",) if drive_only else ()
     try:
-        identified = identify_test(data, model, fit="auto", free=free)
-        if identified.joint is not None and outlying_states(identified.joint.fit).size:
-            identified = identify_test(data, model, fit="auto", free=free, robust=True)
-        return identified, ()
+        return identify_test(data, model, fit="auto", free=free), ()
     except InputError as error:
         if drive_only:
             raise

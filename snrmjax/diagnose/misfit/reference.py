@@ -51,7 +51,7 @@ def reference_of(predictions: Predictions) -> Reference | None:
     states = test_states_of(predictions, rows)
     # The misfit has one relative noise; parts are only separated where phases may be controlled,
     # since their scatter is then that of the frequency.
-    posterior = fit_test(states, parts_of_noise=states.near_one_phase)
+    posterior = fit_test(states, robust=None, parts_of_noise=states.near_one_phase)
     # Evaluate slopes at the actual motion: the records less all estimated errors.
     levels = posterior.level_errors[states.level]
     errors = posterior.corrections[:, 1] - (0.0 if states.force_is_free else levels[:, 0])

@@ -105,12 +105,6 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
         _assessed(problem, cell, float(w), negligible)
         for cell, w in zip(cells, weight, strict=True)
     ]
-    answers: dict[Laws, float] = {}
-    for one in assessed:
-        drawn = (kind for part, kind in DRAWN.items() if one.left[part])
-        laws = tuple(sorted({*drawn, *(law for part in one.laws.values() for law in part)}))
-        answers[laws] = answers.get(laws, 0.0) + one.weight
-    answers = dict(sorted(answers.items(), key=lambda pair: -pair[1]))
     classes = {part: classes_of(assessed, part) for part in (*problem.parts, "instrument")}
     wanted = {kind for effects, _, _ in classes.values() for kind in effects}
     with_all = [
@@ -123,6 +117,11 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
         # A probable instrument error, or a change of which no part alone is probable.
         k = -1 if parts[-1].effects else int(np.argmin([part.probability for part in parts[:-1]]))
         parts[k] = parts[k]._replace(verdict="drawn")
+    answers: dict[Laws, float] = {}
+    for one in assessed:
+        laws = _answer(one, parts)
+        answers[laws] = answers.get(laws, 0.0) + one.weight
+    answers = dict(sorted(answers.items(), key=lambda pair: -pair[1]))
     linear, (stiffness_error, damping_error) = problem.readings.linear, best.solved.linear
     return Naming(
         tuple(parts),
@@ -134,6 +133,16 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
         natural_frequency=linear.natural_frequency + stiffness_error * linear.frequency_std,
         damping_ratio=linear.damping_ratio + damping_error * linear.damping_std,
     )
+
+
+def _answer(one: Assessed, parts: list[PartAnswer]) -> Laws:
+    """The laws of a hypothesis, and drawn remainders of parts that it does not name by a law."""
+    named = {part.part for part in parts if part.verdict in ("named", "ambiguous")}
+    laws = {law for of_part in one.laws.values() for law in of_part}
+    for part, kind in DRAWN.items():
+        if one.left[part] and not (part in named and one.laws[part]):
+            laws.add(kind)
+    return tuple(sorted(laws))
 
 
 def _parameters(problem: Problem, one: Assessed, wanted: set[str]) -> dict[str, Strength]:

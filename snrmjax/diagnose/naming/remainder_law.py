@@ -10,7 +10,8 @@ from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
 
 _KNOTS = 16
 _ANGLES = 200
-_SMOOTH = 1e-4  # weight of second differences, for knots that data do not determine
+_WEIGHTS = np.geomspace(1e4, 1e-4, 33)  # of the roughness, the smoothest law first
+_LEAST_STD = 0.01  # of the largest remainder
 
 
 def remainder_laws(
@@ -24,29 +25,42 @@ def remainder_laws(
         q = largest * remainder.velocity / np.max(remainder.velocity)
         knots = np.geomspace(q[0], q[-1], _KNOTS)
         if part == "stiffness":
-            secant = _secants(q, natural**2 * remainder.value, knots, in_phase=True)
+            secant = natural**2 * _secants(q, remainder, knots, in_phase=True)
             laws.append(StiffnessLaw(jnp.asarray(knots), jnp.asarray(secant * knots)))
         else:
-            secant = _secants(q, 2 * natural * remainder.value, knots, in_phase=False)
+            secant = 2 * natural * _secants(q, remainder, knots, in_phase=False)
             laws.append(DisplacementDampingLaw(jnp.asarray(knots), jnp.asarray(secant)))
     return laws
 
 
 def _secants(
     amplitude: Float[np.ndarray, " point"],
-    value: Float[np.ndarray, " point"],
+    remainder: Remainder,
     knots: Float[np.ndarray, " knot"],
     *,
     in_phase: bool,
 ) -> Float[np.ndarray, " knot"]:
-    """Secants s at knots for which the mean of 2 s(a |cos t|) cos² t, or sin² t, is `value` at a.
+    """Secants s at knots for which the mean of 2 s(a |cos t|) cos² t, or sin² t, is the remainder.
 
-    By regularised least squares, piecewise linear in ln q.
+    Piecewise linear in ln q. The inverse of an average amplifies errors: the law is the smoothest
+    one (second differences) whose averages are the remainder within its 1σ, by the discrepancy
+    principle of Morozov, Sov. Math. Dokl. 7 (1966) 414.
     """
     t = (np.arange(_ANGLES) + 0.5) * 0.5 * np.pi / _ANGLES
     weight = 2 * (np.cos(t) ** 2 if in_phase else np.sin(t) ** 2) / _ANGLES
     at = np.log(np.maximum(np.outer(amplitude, np.cos(t)), knots[0]))
     hats = np.array([np.interp(at, np.log(knots), unit) @ weight for unit in np.eye(len(knots))]).T
-    roughness = _SMOOTH * np.diff(np.eye(len(knots)), 2, axis=0)
-    rows, goal = np.vstack([hats, roughness]), np.concatenate([value, np.zeros(len(roughness))])
-    return np.linalg.lstsq(rows, goal, rcond=None)[0]
+    largest = np.max(np.abs(remainder.value))
+    if largest == 0:
+        return np.zeros(len(knots))
+    std = np.maximum(remainder.std, _LEAST_STD * largest)[:, None]
+    rows, goal = hats / std, remainder.value / std[:, 0]
+    roughness = np.diff(np.eye(len(knots)), 2, axis=0) / np.median(std)
+    secant = np.zeros(len(knots))
+    for weight_of_roughness in _WEIGHTS:
+        both = np.vstack([rows, weight_of_roughness * roughness])
+        wanted = np.concatenate([goal, np.zeros(len(roughness))])
+        secant = np.linalg.lstsq(both, wanted, rcond=None)[0]
+        if np.sqrt(np.mean((rows @ secant - goal) ** 2)) <= 1:
+            break
+    return secant

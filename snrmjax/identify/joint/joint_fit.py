@@ -239,7 +239,7 @@ def fit_jointly(
     free: Sequence[str] = (),
     level_gain_std: float | None = None,
     level_phase_std: float | None = None,
-    robust: bool = False,
+    robust: bool | None = None,
 ) -> JointFit:
     """Fit both curves to the complex force balance of all states at once.
 
@@ -262,6 +262,8 @@ def fit_jointly(
     where only the drive is known. `modes` may be a structure, which also states the 1σ of level
     errors: gain, phase, natural frequency and damping ratio. `level_gain_std` (relative) and
     `level_phase_std` (rad), where given, replace the first two.
+    `robust` gives outliers little weight (Student's t); by default where that noise is the more
+    probable one.
     Returns a `JointFit`; its `status` reports convergence.
     Raises `ValueError` for too few states, an unknown family or name, a family with more parameters
     than data, a gain, offset or phase that the data do not determine, and a fit with negative modal

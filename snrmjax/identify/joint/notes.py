@@ -11,6 +11,7 @@ from scipy.special import chdtri, ndtri
 from snrmjax.identify.checks.residual_autocorrelation import states_of_levels
 from snrmjax.identify.curves.splines import WithRemainder
 from snrmjax.identify.joint.force_balance import BalanceProblem, Motion, Unknowns
+from snrmjax.identify.test_model.posterior import farthest_by_chance
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
@@ -198,21 +199,25 @@ def notes_on_reach(motion: Motion, level: np.ndarray) -> list[Fact]:
     return notes
 
 
-_ONE_TEST_IN = 100  # tests has a false outlier
 _NEIGHBOURS = 2  # states on each side, in the order of frequency within a level
 _MEDIAN_OF_FOUR = 1.2  # variance of that median, times that of the mean
+
+
+def unweighted_residuals(fit: Any) -> np.ndarray:
+    """Residuals in units of the noise, whatever the weights of the states."""
+    weight = np.asarray(fit.data.weight)[:, None]
+    return np.nan_to_num(np.asarray(fit.residuals)[:, :2] / np.sqrt(weight))
 
 
 def outlying_states(fit: Any) -> np.ndarray:
     """Indices of outlying states, which noise does not explain.
 
-    For two normal residuals of each of n states the largest magnitude exceeds √(−2 ln(p/n)) in a
-    fraction p of tests, here one in a hundred (Bonferroni). The difference from the neighbours'
-    median must exceed it too: a curve that misses a whole stretch of states makes no outlier.
+    Their residual exceeds `farthest_by_chance`. The difference from the neighbours' median must
+    exceed it too: a curve that misses a whole stretch of states makes no outlier.
     """
-    residuals = np.nan_to_num(np.asarray(fit.residuals)[:, :2])
+    residuals = unweighted_residuals(fit)
     level, frequency = np.asarray(fit.data.level), np.asarray(fit.data.frequency)
-    beyond = np.sqrt(2 * np.log(_ONE_TEST_IN * max(1, len(residuals))))
+    beyond = farthest_by_chance(len(residuals))
     alone = np.zeros_like(residuals)
     for rows in states_of_levels(level, frequency):
         for k, row in enumerate(rows):
@@ -224,16 +229,17 @@ def outlying_states(fit: Any) -> np.ndarray:
     return np.flatnonzero(far)
 
 
-def note_on_outlying(fit: Any, *, robust: bool) -> tuple[Fact, ...]:
+def note_on_outlying(fit: Any) -> tuple[Fact, ...]:
     """A note that lists the outlying states, the largest residual first."""
     rows = outlying_states(fit)
     if not rows.size:
         return ()
-    distance = np.hypot(*np.asarray(fit.residuals)[rows, :2].T)
+    distance = np.hypot(*unweighted_residuals(fit)[rows].T)
     rows = rows[np.argsort(-distance)]
     data = fit.data
     states = tuple(
         (fit.level_numbers[int(data.level[k])], float(data.frequency[k]) / HERTZ)
         for k in rows.tolist()
     )
+    robust = bool(np.any(np.asarray(data.weight) != 1))
     return (Fact("states_outlying", states=states, farthest=float(distance.max()), robust=robust),)

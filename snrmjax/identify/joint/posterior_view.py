@@ -57,7 +57,7 @@ def view_of(
     free: tuple[str, ...],
     stated: bool,
     *,
-    robust: bool,
+    robust: bool | None,
     knots: int | None = None,
 ) -> View:
     """The posterior of a joint fit's states, with curves of the chosen families.
@@ -68,8 +68,9 @@ def view_of(
     the model's, unless the states contradict it, which those at a controlled phase cannot;
     frequency scatter is added to every state's errors where the states show it.
 
-    Arguments: `free` the unknown instrument errors; `stated` whether the noise is; `knots` the
-    largest number of each curve.
+    Arguments: `free` the unknown instrument errors; `stated` whether the noise is; `robust` whether
+    it has outliers (Student's t), None: where that is more probable; `knots` the largest number of
+    each curve.
     """
     guess = _complex_gain(problem) if {"force_gain", "instrument_phase"} & set(free) else 1.0 + 0j
     gain = abs(guess) if "force_gain" in free else 1.0
@@ -77,9 +78,11 @@ def view_of(
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     states = _test_states(problem, free, stated, guess)
     rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
-    fit = functools.partial(fit_test, robust=robust, power_likelihood=True)
+    fit = functools.partial(fit_test, power_likelihood=True)
     first = functools.partial(fit, compare_levels=False, parts_of_noise=True)
-    posterior = first(states, rounds=rounds)
+    posterior = first(states, rounds=rounds, robust=robust)
+    robust = bool(np.any(posterior.weight != 1))
+    fit, first = (functools.partial(one, robust=robust) for one in (fit, first))
     if _noise_of(posterior, stated).exceeded:  # the curves may be steeper than the knots resolve
         posterior = first(states, rounds=rounds._replace(crowded=True))
     mass, std = posterior.modal_mass
@@ -114,12 +117,12 @@ def view_of(
         scale * posterior.states.errors,
         posterior.corrections,
     )
+    ratio = posterior.level_std / noise.level_std
     new_level = np.where(
         np.array(states.level_std) > 0,
         states.level_std,
         students_factor(states.n_levels - 1) * noise.level_std,
     )
-    ratio = posterior.level_std / noise.level_std
     of_levels = map(jax.device_put, (posterior.level_std, ratio, new_level))
     z = 1j * states.frequency * states.constant * states.force / states.velocity
     problem = dataclasses.replace(

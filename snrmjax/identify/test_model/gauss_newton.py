@@ -217,7 +217,7 @@ class GaussNewton:
             fraction = independent_fraction(residual, states.level, states.frequency)
             self.fraction = max(fraction, priors.LEAST_FRACTION)
         if self.robust:
-            square = np.sum(residual**2, axis=1) / noise**2
+            square = np.sum(residual**2, axis=1) / (noise**2 * self.balance.weight)
             weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
             self.balance = self.balance._replace(weight=weight)
 

@@ -60,6 +60,7 @@ _ALL = Rounds()
 _NOISE_ROUNDS = 3  # of estimating the noise components, at most
 _SAME_NOISE = 0.1  # relative convergence tolerance of the components
 _LITTLE_MORE = 2.0  # ratio of phase spread to frequency scatter: more is not phase control
+_ONE_TEST_IN = 100  # tests has a false outlier
 _REACH = 3.0  # dynamic stiffnesses that ω̃² may lie outside the tested range of Ω²
 
 
@@ -197,7 +198,7 @@ def fit_test(
     states: TestStates,
     *,
     discrepancy: bool = False,
-    robust: bool = False,
+    robust: bool | None = False,
     power_likelihood: bool = False,
     average_roughness: bool = False,
     compare_levels: bool = True,
@@ -207,7 +208,8 @@ def fit_test(
     """The posterior of a test.
 
     Arguments: `discrepancy` adds a misfit of the single-mode model off resonance, smooth in phase
-    and amplitude and zero at phase resonance; `robust` allows outliers (Student's t);
+    and amplitude and zero at phase resonance; `robust` allows outliers (Student's t), None: where
+    that is more probable;
     `power_likelihood` counts states with correlated residuals as fewer; `average_roughness`
     averages over the roughness of the curves; without `compare_levels` nothing is reported on how
     levels differ (`differing`), which halves the time; `parts_of_noise` estimates the natural
@@ -217,19 +219,18 @@ def fit_test(
     """
     if len(states.level) < 2:
         raise InputError(f"a test needs at least two states, not {len(states.level)}.")
+    settings = {
+        "discrepancy": discrepancy,
+        "power_likelihood": power_likelihood,
+        "average_roughness": average_roughness,
+        "compare_levels": compare_levels,
+    }
+    if robust is None:
+        settings |= {"parts_of_noise": parts_of_noise}
+        return _with_likely_noise(functools.partial(fit_test, states, rounds=rounds, **settings))
     if parts_of_noise:
-        return _with_parts_of_noise(
-            functools.partial(
-                fit_test,
-                discrepancy=discrepancy,
-                robust=robust,
-                power_likelihood=power_likelihood,
-                average_roughness=average_roughness,
-                compare_levels=compare_levels,
-            ),
-            states,
-            rounds,
-        )
+        fit = functools.partial(fit_test, robust=robust, **settings)
+        return _with_parts_of_noise(fit, states, rounds)
     n, omega = len(states.level), states.frequency
     reference = float(np.mean(omega**2))
     z = 1j * omega * states.constant * states.force / (states.velocity)
@@ -262,25 +263,24 @@ def fit_test(
     best = solver.best
     if best is None:
         raise InputError(f"`rounds.most` must be at least one, not {rounds.most}.")
-    # 1σ of level errors from few levels is uncertain: widened as Student's t. Their mean, and a
-    # part correlated with force, are attributed to the curves, but the bands allow for them as
-    # level errors (`exchanged`).
+    # 1σ of level errors from few levels is uncertain: widened as Student's t. Their mean is not
+    # projected out here: states off resonance determine it. A part correlated with force is
+    # attributed to the curves, but the bands allow for it as a level error (`exchanged`).
     last = solver.balance.linearised(best.mean, best.errors, apart=False)
-    equations = last.equations._replace(fraction=best.equations.fraction)
+    fraction = best.equations.fraction * (priors.STUDENT_INFORMATION if robust else 1.0)
+    equations = last.equations._replace(fraction=fraction)
     exchanged = equations
     if any(solver.balance.in_order):
         free = solver.balance._replace(in_order=(False,) * 4)
         anew = free.linearised(best.mean, best.errors, apart=False)
-        exchanged = anew.equations._replace(fraction=equations.fraction)
+        exchanged = anew.equations._replace(fraction=fraction)
 
     variances = prior_variances(terms, layout, states)
+    objective = objective_of(best.equations, states, terms, layout)
 
     def gaussian(point: np.ndarray) -> Gaussian:
         noise, variance = np.exp(point[NOISE]), variances(point)
-        # The mean has no common level error: the roughness prior would shrink the curves and shift
-        # the rest to the levels.
-        mean = best.equations.posterior(noise, variance)[0]
-        covariance = equations.posterior(noise, variance)[1]
+        mean, covariance = equations.posterior(noise, variance)
         known = variance > 0
         informed = np.zeros_like(variance)  # per unknown, after what curves absorb
         informed[known] = 1 - np.diag(covariance)[known] / variance[known]
@@ -291,21 +291,21 @@ def fit_test(
         wide = exchanged.posterior(noise, variance)[1]
         return Gaussian(mean, wide, float(np.sum(informed)), np.sqrt(variance[layout.levels[0]]))
 
-    objective = objective_of(best.equations, states, terms, layout)
     bounds = bounds_of(states, terms, best.point)
     point, summary = best.point, gaussian(best.point)
     if average_roughness:
         grid = roughness_grid(objective, best.point, bounds)
         point, summary = averaged(grid, gaussian)
     flat = objective_of(best.equations, states, terms, layout, flat=True)
+    tails = _log_tails(best.residuals, solver.balance.weight) if robust else 0.0
     posterior = TestPosterior(
         states,
         terms,
         summary.mean,
         summary.covariance,
         hyper_at(point, terms),
-        laplace_evidence(objective, best.point, bounds),
-        _log_likelihood(best),
+        laplace_evidence(objective, best.point, bounds) + tails,
+        _log_likelihood(best) + tails,
         best.errors,
         best.residuals * np.exp(best.point[NOISE] - point[NOISE]),
         summary.effective_unknowns,
@@ -391,9 +391,40 @@ def _log_likelihood(best: Iterate) -> float:
     return best.equations.offset - 0.5 * float(np.sum(residuals**2) + residuals.size * each)
 
 
+def _log_tails(
+    residuals: Float[np.ndarray, "state part"], weight: Float[np.ndarray, " state"]
+) -> float:
+    """ln of Student's t over the weighted normal density that stands for it, at the residuals.
+
+    Reference: for the weights of the bivariate distribution, Lange, Little & Taylor, J. Am. Stat.
+    Assoc. 84 (1989) 881, doi:10.1080/01621459.1989.10478852.
+    """
+    freedom, square = priors.STUDENT_FREEDOM, np.sum(residuals**2, axis=1)
+    tail = 0.5 * (freedom + 2) * np.log1p(square / (weight * freedom))
+    return float(np.sum(0.5 * square - np.log(weight) - tail))
+
+
 def students_factor(freedom: float) -> float:
     """Ratio of Student's t to the normal 97.5 % quantile: widening of a 95 % band.
 
     At least two degrees of freedom: with one the band would be useless.
     """
     return float(stdtrit(max(freedom, 2), 0.975) / ndtri(0.975))
+
+
+def farthest_by_chance(n_states: int, expected: float = 1 / _ONE_TEST_IN) -> float:
+    """Magnitude of whitened residuals that `expected` of the states exceed by chance (Bonferroni).
+
+    For two normal residuals of each of n states, n exp(−r²/2) are expected beyond r.
+    """
+    return float(np.sqrt(2 * np.log(max(1, n_states) / expected)))
+
+
+def _with_likely_noise(fit: Callable[..., TestPosterior]) -> TestPosterior:
+    """The posterior with normal noise, or with outliers where that is more probable."""
+    normal = fit(robust=False)
+    farthest = float(np.max(np.hypot(*normal.residuals.T)))
+    # An outlier hides in the noise and level errors that it enlarges: a low threshold.
+    if farthest <= farthest_by_chance(len(normal.residuals), expected=1.0):
+        return normal
+    return max((normal, fit(robust=True)), key=lambda one: one.log_evidence)

@@ -189,5 +189,8 @@ DISCREPANCY_LENGTH = np.radians(30.0)
 STUDENT_FREEDOM = 4.0
 """Student's t degrees of freedom of noise with outliers: one state in 20 lies beyond 3σ."""
 
+STUDENT_INFORMATION = (STUDENT_FREEDOM + 2) / (STUDENT_FREEDOM + 4)
+"""Fisher information of the bivariate distribution over that of the normal ones of its weights."""
+
 LEAST_FRACTION = 0.1
 """Lower bound of the independent fraction of the states: while curves are far off it is too low."""

@@ -371,7 +371,7 @@ def _averaged(
         return quartic * amplitude**2, 0.0
     influence = np.asarray(elements_of(model.forces, model.modes).influence)[:, mode]
     local = np.abs(influence) * amplitude[:, None]
-    each = jax.vmap(averaged_at_attachments, (None, 0, None))(model, local, frequency)
+    each = _at_amplitudes(model, local, frequency)
     stiffer, damped = (np.asarray(part) @ influence**2 for part in each)
     return quartic * amplitude**2 + np.maximum(stiffer, 0.0), damped
 
@@ -418,3 +418,10 @@ def averaged_at_attachments(
         jnp.where(moves, cosine / divisor, 0.0),
         jnp.where(moves, -sine / (divisor * frequency), 0.0),
     )
+
+
+@compiled
+def _at_amplitudes(
+    model: Structure, amplitude: Float[Array, "amplitude attachment"], frequency: Float[Array, ""]
+) -> AveragedForce:
+    return jax.vmap(averaged_at_attachments, (None, 0, None))(model, amplitude, frequency)

@@ -167,6 +167,25 @@ def test_robust_noise_ignores_outliers():
     assert np.abs(robust).max() < 2 * np.abs(clean).max() < np.abs(plain).max()
 
 
+@pytest.mark.parametrize(("outliers", "preferred"), [(0, False), (4, True)])
+def test_outliers_make_students_t_the_more_probable_noise(outliers, preferred):
+    test = made(6, outliers=outliers)
+    normal, heavy = (test.fit(robust=one).log_evidence for one in (False, True))
+    assert (heavy > normal) == preferred
+    weight = test.fit(robust=None).weight
+    assert (weight.min() < 0.1) == preferred
+
+
+def test_a_far_outlier_has_the_weight_of_students_t():
+    """6/(4 + q) for the squared distance q of a state from the curves, in units of the noise."""
+    test = made(5, outliers=4)
+    found = test.fit(robust=True)
+    square = np.sum(found.residuals**2, axis=1) / found.weight
+    assert square.max() > 100
+    # The weights of the last iteration belong to the curves of the one before.
+    np.testing.assert_allclose(found.weight, 6 / (4 + square), rtol=0.05)
+
+
 def test_level_errors_correlated_with_force_are_detected(known):
     # Fitted phases (deg) of a softening wire, for which one mode leaves correlated residuals, and
     # the same in another order: p = 0.002 and 0.8.
