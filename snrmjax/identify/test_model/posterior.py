@@ -61,6 +61,7 @@ _NOISE_ROUNDS = 3  # of estimating the noise components, at most
 _SAME_NOISE = 0.1  # relative convergence tolerance of the components
 _LITTLE_MORE = 2.0  # ratio of phase spread to frequency scatter: more is not phase control
 _ONE_TEST_IN = 100  # tests has a false outlier
+_STUDENT_STD = float(np.sqrt(priors.STUDENT_FREEDOM / (priors.STUDENT_FREEDOM - 2)))
 _REACH = 3.0  # dynamic stiffnesses that ω̃² may lie outside the tested range of Ω²
 
 
@@ -264,8 +265,9 @@ def fit_test(
     if best is None:
         raise InputError(f"`rounds.most` must be at least one, not {rounds.most}.")
     # 1σ of level errors from few levels is uncertain: widened as Student's t. Their mean is not
-    # projected out here: states off resonance determine it. A part correlated with force is
-    # attributed to the curves, but the bands allow for it as a level error (`exchanged`).
+    # projected out here: states off resonance determine it; of others the prior of the curves would
+    # assign it a part of the damping. A part correlated with force is attributed to the curves. The
+    # bands allow for both as level errors (`exchanged`).
     last = solver.balance.linearised(best.mean, best.errors, apart=False)
     fraction = best.equations.fraction * (priors.STUDENT_INFORMATION if robust else 1.0)
     equations = last.equations._replace(fraction=fraction)
@@ -280,7 +282,9 @@ def fit_test(
 
     def gaussian(point: np.ndarray) -> Gaussian:
         noise, variance = np.exp(point[NOISE]), variances(point)
-        mean, covariance = equations.posterior(noise, variance)
+        estimating = best.equations if states.near_one_phase else equations
+        mean = estimating.posterior(noise, variance)[0]
+        covariance = equations.posterior(noise, variance)[1]
         known = variance > 0
         informed = np.zeros_like(variance)  # per unknown, after what curves absorb
         informed[known] = 1 - np.diag(covariance)[known] / variance[known]
@@ -421,10 +425,17 @@ def farthest_by_chance(n_states: int, expected: float = 1 / _ONE_TEST_IN) -> flo
 
 
 def _with_likely_noise(fit: Callable[..., TestPosterior]) -> TestPosterior:
-    """The posterior with normal noise, or with outliers where that is more probable."""
+    """The posterior with normal noise, or with outliers where there are and that is more probable.
+
+    Without outliers heavier tails may be the more probable ones too, where the stated noise is too
+    small.
+    """
     normal = fit(robust=False)
-    farthest = float(np.max(np.hypot(*normal.residuals.T)))
+    n, largest = len(normal.weight), float(np.max(np.hypot(*normal.residuals.T)))
     # An outlier hides in the noise and level errors that it enlarges: a low threshold.
-    if farthest <= farthest_by_chance(len(normal.residuals), expected=1.0):
+    if largest <= farthest_by_chance(n, expected=1.0):
         return normal
-    return max((normal, fit(robust=True)), key=lambda one: one.log_evidence)
+    tails = fit(robust=True)
+    farthest = float(np.max(np.hypot(*tails.residuals.T) / np.sqrt(tails.weight)))
+    has_outliers = farthest > _STUDENT_STD * farthest_by_chance(n)
+    return tails if has_outliers and tails.log_evidence > normal.log_evidence else normal
