@@ -76,9 +76,9 @@ def periodic_motion(
     Returns a `PeriodicMotion`, also under `jax.jit` and `jax.vmap` (models with the same modes,
     monomials and effects; all take as many iterations as the slowest). If Newton's method did not
     converge its values and their derivatives are NaN: start nearer, or use `TrackedMotion`.
-    With sliders and contacts the slope of the response jumps where one of the time samples begins
-    to slip or to touch, so that "peak" and "fold" may not converge from any start: take
-    "phase_resonance", "frequency" or "velocity" there.
+    With sliders and contacts the slope of the response changes fast where the motion begins to
+    slip or to touch: if "peak" or "fold" does not converge there, take "phase_resonance",
+    "frequency" or "velocity".
     Members of a batch that a result leaves out add nothing to its derivatives; mask them before
     further computation, by `jnp.where(motion.converged, motion.frequency, 1.0)`. From a distant
     start Newton's method may converge to another motion: in an optimisation use `TrackedMotion`.
