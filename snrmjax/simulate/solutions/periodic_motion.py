@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.newton import ROUNDING, Point, newton
 from snrmjax.numerics.result import AbstractResult, Variable
@@ -52,6 +53,7 @@ class PeriodicMotion(AbstractResult):
         )
 
 
+@on_one_core
 def periodic_motion(
     model: Structure,
     force: float | Float[ArrayLike, ""],
@@ -68,7 +70,8 @@ def periodic_motion(
     of interest ("phase_resonance"), s being the arclength of the response curve, by Newton's
     method with exact derivatives. The result is a differentiable function of every number of
     `model`, of `force` and of `value`, by the implicit function theorem: in forward and in reverse
-    mode, and of second order (a Hessian times a vector is `jax.jvp` of `jax.grad`). `start`
+    mode, and of second order (a Hessian times a vector is `jax.jvp` of `jax.grad`; that of a "peak"
+    or a "fold" of a structure with contacts compiles for a minute or two, once). `start`
     (coefficients in kg^1/2 m and frequency in rad/s, such as `ResponseCurve.point`) only selects
     the solution: derivatives by it are zero.
 
