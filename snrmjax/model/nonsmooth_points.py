@@ -200,8 +200,9 @@ def with_slip_corners(
     cubic = _cubic(q[(interval + np.arange(-1, 3)[:, None]) % n])
     # A slider starts at a root of the displacement beyond slip, and stops at one of its slope.
     beyond = cubic[0] - z[interval] - side[interval] * slip
-    sought = zip((beyond, *cubic[1:]), _derivative(cubic), strict=True)
-    equation = tuple(jnp.where(starts, start, stop) for start, stop in sought)
+    # A slider starts at a root of the displacement beyond slip, and stops at one of its slope.
+    start, stop = (beyond, *cubic[1:]), _derivative(cubic)
+    equation: Cubic = jax.tree.map(lambda *of: jnp.where(starts, *of), start, stop)
     theta = _differentiable(fraction.reshape(-1)[slot], equation, known)
     rate, curvature = _slopes(theta, cubic)
     first_jump = jnp.where(known & starts, rate, 0.0)
@@ -219,7 +220,7 @@ def _slip_corners(z: Samples, q: Samples, slip: Array) -> tuple[Array, Array, Ar
     # At most rounding from slipping: it slips already.
     slips = slip - jnp.abs(q - z) <= 1e-12 * (slip + jnp.abs(q))
     starts = (side != 0) & ~slips
-    beyond = side * (q - z) - slip, *(side * part for part in cubic[1:])
+    beyond: Cubic = side * (q - z) - slip, side * cubic[1], side * cubic[2], side * cubic[3]
     root = _first_root(beyond, side * (second - z) - slip, starts)
     root = _improved(jnp.clip(root, 0.0, 1.0), beyond)
     stops = (turn > 0) & (side * (extremum - z) > slip)
