@@ -101,7 +101,8 @@ def decaying_columns(
         chain[2 : 2 + n_powers, 1 : 1 + n_powers] = np.eye(n_powers)
         chain[2 + n_powers :, 2 + n_powers :] = np.eye(n_powers)
         log_by, phase_by = chain @ flow.log_by, chain @ flow.phase_by
-        terms, first = [(k, n + k)], 2 * n + 1
+        terms: list[tuple[int, ...]] = [(k, n + k)]
+        first = 2 * n + 1
         for order, _ in form.harmonics:
             terms.append((first, first + 1) if order else (first,))
             first += len(terms[-1])
