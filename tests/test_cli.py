@@ -233,6 +233,39 @@ def test_wrong_data_ends_with_two_and_one_sentence(files, tmp_path, name):
     assert not out.exists()
 
 
+EFFECT = '[[effect]]\nkind = "{kind}"\n{entries}\n'
+WRONG_MODELS = {
+    "unknown kind": EFFECT.format(kind="coulomb", entries="force = 1.0"),
+    "missing parameter": EFFECT.format(kind="one_sided_stop", entries="gap = 1.0"),
+    "wrong number": EFFECT.format(kind="one_sided_stop", entries="gap = 1.0\nstiffness = 'stiff'"),
+    "unknown point": EFFECT.format(
+        kind="one_sided_stop", entries='gap = 1.0\nstiffness_n_per_m = 1.0\nat = "tip"'
+    ),
+    "other name": EFFECT.format(
+        kind="one_sided_stop", entries='gap_m = 1.0\nstiffness = 1.0\nat = "midspan"'
+    ),
+    "unknown mode": '[[vary]]\nparameter = "mode_1.damping_ratio"',
+}
+
+
+@pytest.mark.parametrize("name", WRONG_MODELS)
+def test_a_refusal_names_the_file_once(files, tmp_path, name):
+    model, _ = files
+    model.write_text(MODEL + WRONG_MODELS[name])
+    code, stderr = run("nnm", model, "--to-hz", 80, "--out", tmp_path / "out")
+    assert code == 2
+    (line,) = [one for one in stderr.splitlines() if one.startswith("error: ")]
+    assert line.count("model.toml") == 1
+    assert line.count("error") == 1
+
+
+def test_a_refusal_is_located_once():
+    first = InputError.located("beam.toml", "the mesh has 3 modes.")
+    assert str(first) == "beam.toml: the mesh has 3 modes."
+    assert str(InputError.located("beam.toml", first)) == str(first)
+    assert str(InputError.located("beam.toml", "row 3 of beam.toml is empty.")).count("beam") == 1
+
+
 def test_a_wrong_model_ends_with_two(files, tmp_path):
     model, data = files
     model.write_text(MODEL.replace("damping_ratio", "dampng_ratio"))

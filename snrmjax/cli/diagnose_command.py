@@ -84,7 +84,7 @@ def diagnose(
         except InputError as error:
             if not several:
                 raise
-            warn(f"{path.name}: {error}")
+            warn(InputError.located(path.name, error))
             refused.append(path.name)
             continue
         if not several:

@@ -40,7 +40,7 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
     try:
         basis = beam_modes(beam, stated.modes)
     except InputError as error:
-        raise InputError(f"{file}: {error}") from error
+        raise InputError.located(file, error) from error
     modal = _modal_data(beam, basis, stated.sensors, stated.force_at)
     known = have_values((basis, modal))
     if known:

@@ -298,7 +298,7 @@ def _effect(table: TomlTable) -> AbstractEffect:
     try:
         kind, entries = known.present_names(table.text("kind"), table.entries, at_points=at_points)
     except InputError as error:
-        raise InputError(f"{table.location}: {error}") from error
+        raise InputError.located(table.location, error) from error
     kinds = known.known_effects()
     if kind not in kinds:
         near = suggestion(kind, kinds) or f" (known are {', '.join(sorted(kinds))})"

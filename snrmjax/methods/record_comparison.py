@@ -57,7 +57,7 @@ def states_of(test: RecordedTest) -> tuple[SteadyStates, Fact]:
         states = sweep_states(test.recording, force, channels.motions, **settings).states
         return states, Fact("states_read", n=states.n_states)
     except InputError as error:
-        raise InputError(f"{test.recording.name}: {error}") from error
+        raise InputError.located(test.recording.name, error) from error
 
 
 def with_decays(test: RecordedTest, modes: LinearModes) -> RecordedTest:
@@ -164,7 +164,7 @@ def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearMod
             results += method.run(test, modes)
             read.append(test)
         except (InputError, np.linalg.LinAlgError) as error:
-            reasons.append(f"{error} ({test.recording.name})")
+            reasons.append(str(InputError.located(test.recording.name, error)))
     if not results:
         return MethodRun(None, reasons[0])
     notes = [

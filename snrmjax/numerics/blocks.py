@@ -166,7 +166,8 @@ def on_one_core(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def alone(*arguments: P.args, **named: P.kwargs) -> R:
         with _linear_algebra().limit(limits=1, user_api="blas"):
-            return function(*arguments, **named)
+            # Programs run after their call has returned: the setting holds until they end.
+            return jax.block_until_ready(function(*arguments, **named))
 
     return alone
 

@@ -12,6 +12,12 @@ class InputError(ValueError):
     Whatever else is raised, a `ValueError` of NumPy or JAX too, is an error of this package.
     """
 
+    @classmethod
+    def located(cls, where: str, error: Exception | str) -> "InputError":
+        """A refusal with the file, table or record it concerns in front, unless it names it."""
+        message = str(error)
+        return cls(message if where in message else f"{where}: {message}")
+
 
 class Rule(NamedTuple):
     """A condition on a number or on every entry, and its wording in a message."""

@@ -19,6 +19,7 @@ from snrmjax.simulate.continuation.event_equations import FORCE, EventKind
 from snrmjax.simulate.continuation.response_curve import (
     Branch,
     ResponseCurve,
+    period_doublings,
     without_stable_response,
 )
 from snrmjax.simulate.continuation.stability import Stability
@@ -37,8 +38,8 @@ _log = logging.getLogger(__name__)
 
 _TRUNCATED = 0.02  # fraction of the velocity in truncated harmonics above which a note is given
 _KNOWN_DAMPING = 1e-5  # relative 1σ of a damping ratio above which a note is given
+_SAME_GAP = 1e-4  # relative frequency difference between a gap in stability and its event
 _SAME_EVENT = 1e-6  # relative frequency difference between an event and a curve of events
-_ENDS = (CurveStatus.UPPER_END, CurveStatus.LOWER_END)
 
 
 class SimulatedResponses(NamedTuple):
@@ -217,8 +218,9 @@ def simulate_mode(
         ),
         *_notes_on_instability(branch),
     ]
-    if branch.status not in _ENDS:
-        notes.append(Fact("mode_not_followed", status=branch.status))
+    if branch.status != (CurveStatus.UPPER_END if to_hz > linear else CurveStatus.LOWER_END):
+        ends_hz = float(branch.frequency[-1]) / HERTZ
+        notes.append(Fact("mode_not_followed", to_hz=to_hz, ends_hz=ends_hz, status=branch.status))
     sensor = model.modes.sensors[reference_sensor(model.modes)]
     return SimulatedMode(branch, sensor, tuple(notes))
 
@@ -250,7 +252,18 @@ def _notes_on_force(
     at = {"force": curves[0].force, "unit": unit}
     for first, last in without_stable_response(shown, *ends):
         hertz = {"from_hz": first / HERTZ, "to_hz": last / HERTZ}
-        yield Fact("no_stable_response", **at, **hertz, isolated=isolated)
+        doublings = tuple(
+            event / HERTZ
+            for event in period_doublings(shown)
+            if min(abs(event / first - 1), abs(event / last - 1)) < _SAME_GAP
+        )
+        yield Fact(
+            "no_stable_response",
+            **(at | hertz),
+            isolated=isolated,
+            wells=sum(bool(state.stable) for state in equilibria(model)),
+            doublings_hz=doublings,
+        )
     for idle in idle_elements(model, shown):
         yield Fact("element_idle", **at, **idle._asdict())
 

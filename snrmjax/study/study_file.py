@@ -82,7 +82,7 @@ def read_study(path: FilePath) -> Study:
     try:
         study.ensemble()
     except InputError as error:
-        raise InputError(f"{file}: {error}") from error
+        raise InputError.located(file, error) from error
     return study
 
 

@@ -91,6 +91,21 @@ def test_simulation(files, tmp_path):
         sj.pipelines.simulate_mode(given, 60.0)
 
 
+def test_a_mode_that_does_not_reach_the_frequency_asked_for_says_where_it_ends():
+    modes = sj.model.linear_modes([1.0], [0.02], [[1.0]], [1.0])
+    softening = sj.model.structure(modes, sj.model.polynomial_potential({"1111": -0.25}, 1))
+    found = sj.pipelines.simulate_mode(softening, 0.3, harmonics=3)
+    (note,) = [note for note in found.notes if note.kind == "mode_not_followed"]
+    # q̈ + q − q³ = 0: its frequency falls to zero at the separatrix, below 1/(2π) everywhere.
+    assert note["ends_hz"] == found.branch.frequency[-1] / (2 * np.pi) < 0.16
+    assert note["to_hz"] == 0.3
+    assert not [
+        n
+        for n in sj.pipelines.simulate_mode(softening, 0.15, harmonics=3).notes
+        if n.kind == "mode_not_followed"
+    ]
+
+
 def test_only_results_of_pipelines_have_files(tmp_path):
     with pytest.raises(ValueError, match="a `dict` has no files"):
         sj.write_results({}, tmp_path)

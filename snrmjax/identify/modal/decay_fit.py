@@ -9,7 +9,7 @@ Reference: Feldman, Mech. Syst. Signal Process. 25 (2011) 735, doi:10.1016/j.yms
 Modes are fitted to records by least squares one after another, the strongest first.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +45,9 @@ _SETTLED = 1e-3  # of the sum of squares: 0.03 standard errors
 _NEW = 1e-4  # of a wave outside the space of the present modes, below which it is no separate mode
 
 
+Waves = Complex[np.ndarray, "*batch sample"]
+
+
 class WaveForm(NamedTuple):
     """Layout of the unknowns: ω and ζ of every mode, then all d_j and all w_j."""
 
@@ -73,13 +76,23 @@ def decaying_columns(
     omega, ratio = unknowns[:n], unknowns[n : 2 * n]
     root = np.sqrt(1 - ratio**2)
     pole = -ratio * omega + 1j * omega * root
-    wave = np.exp(time[:, None] * pole)
-    slopes = np.zeros((len(unknowns), len(time), n), dtype=complex)
-    at = np.arange(n)
-    slopes[at, :, at] = (time[:, None] * wave * (pole / omega)).T
-    slopes[n + at, :, at] = (time[:, None] * wave * (-omega - 1j * omega * ratio / root)).T
-    if n_powers or form.harmonics:
-        k = form.leading
+    n_terms = 2 * n + 1 + sum(2 if order else 1 for order, _ in form.harmonics)
+    # Term by term in memory: each is written, and weighted by the fit, in one stride.
+    columns = np.ones((n_terms, len(time)))
+    by = np.zeros((len(unknowns), n_terms, len(time)))
+
+    def put(terms: Sequence[int], wave: Waves, rows: Sequence[int], slopes: Waves) -> None:
+        columns[terms[0]], by[rows, terms[0]] = wave.real, slopes.real
+        for term in terms[1:]:
+            columns[term], by[rows, term] = -wave.imag, -slopes.imag
+
+    depends = form.leading if n_powers or form.harmonics else None
+    for k in set(range(n)) - {depends}:
+        wave, rows = np.exp(time * pole[k]), (k, n + k)
+        rates = np.array([pole[k] / omega[k], -omega[k] - 1j * omega[k] * ratio[k] / root[k]])
+        put(rows, wave, rows, rates[:, None] * (time * wave))
+    if depends is not None:
+        k = depends
         flow = _flow(time, pole[k], unknowns[2 * n :], form.powers)
         # Derivatives of d_0 = ζω and w_0 = ω√(1 − ζ²) with respect to ω and ζ.
         chain = np.zeros((2 + 2 * n_powers, 2 + 2 * n_powers))
@@ -88,27 +101,16 @@ def decaying_columns(
         chain[2 : 2 + n_powers, 1 : 1 + n_powers] = np.eye(n_powers)
         chain[2 + n_powers :, 2 + n_powers :] = np.eye(n_powers)
         log_by, phase_by = chain @ flow.log_by, chain @ flow.phase_by
-        rows = np.concatenate([[k, n + k], np.arange(2 * n, len(unknowns))])
-
-        amplitude, rotation = np.exp(flow.log_amplitude), np.exp(1j * flow.phase)
-
-        def harmonic_column(order: int, power: int) -> tuple[np.ndarray, np.ndarray]:
-            column = amplitude**power * rotation**order
-            by = np.zeros((len(unknowns), len(time)), dtype=complex)
-            by[rows] = (power * log_by + 1j * order * phase_by) * column
-            return column, by
-
-        wave[:, k], slopes[:, :, k] = harmonic_column(1, 1)
-    columns = [wave.real, -wave.imag, np.ones((len(time), 1))]
-    by = [slopes.real, -slopes.imag, np.zeros((len(unknowns), len(time), 1))]
-    for order, power in form.harmonics:
-        column, slope = harmonic_column(order, power)
-        for part, part_by in ((column.real, slope.real), (-column.imag, -slope.imag))[
-            : 2 if order else 1
-        ]:
-            columns.append(part[:, None])
-            by.append(part_by[:, :, None])
-    return TermColumns(np.concatenate(columns, axis=1), np.concatenate(by, axis=2))
+        terms: list[tuple[int, ...]] = [(k, n + k)]
+        first = 2 * n + 1
+        for order, _ in form.harmonics:
+            terms.append((first, first + 1) if order else (first,))
+            first += len(terms[-1])
+        for at, (order, power) in zip(terms, ((1, 1), *form.harmonics), strict=True):
+            wave = np.exp(power * flow.log_amplitude + 1j * order * flow.phase)
+            slopes = (power * log_by + 1j * order * phase_by) * wave
+            put(at, wave, (k, n + k, *range(2 * n, len(unknowns))), slopes)
+    return TermColumns(columns.T, by.transpose(0, 2, 1))
 
 
 def _flow(time: np.ndarray, pole: complex, terms: np.ndarray, powers: tuple[int, ...]) -> _Flow:

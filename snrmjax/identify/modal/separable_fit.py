@@ -131,7 +131,7 @@ def _projected(basis: TermColumns, values: np.ndarray, weights: np.ndarray) -> _
     inverse = np.linalg.pinv(triangle, rcond=1e-12) @ orthogonal.T / norm[:, None]
     rows = values * weights
     coefficients = inverse @ rows
-    slopes = np.einsum("urt,t->ru", basis.derivatives, coefficients) * weights[:, None]
+    slopes = (basis.derivatives @ coefficients).T * weights[:, None]
     outside = slopes - orthogonal @ (orthogonal.T @ slopes)
     residuals = rows - orthogonal @ (orthogonal.T @ rows)
     return _Projected(coefficients, inverse, slopes, outside, residuals)

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from snrmjax.measure.decays.decay_reading import DecayReading, wave_of
 from snrmjax.measure.decays.local_fit import Carrier
@@ -32,11 +32,15 @@ class MainsTone(NamedTuple):
 
     hertz: float
     amplitude: float
+    unit: Complex[np.ndarray, " sample"]  # of amplitude one
     wave: Float[np.ndarray, " sample"]
 
 
 def mains_hum(time: np.ndarray, signal: np.ndarray, reading: DecayReading) -> list[MainsTone]:
-    """Steady mains tones in the residual of the smooth decay."""
+    """Steady mains tones in the residual of the smooth decay.
+
+    A line that decays as a harmonic of the mode itself does is none.
+    """
     carrier = Carrier(reading.carrier.time, reading.smooth.level)
     inside = (time >= carrier.time[0]) & (time <= carrier.time[-1])
     at = time[inside]
@@ -52,7 +56,8 @@ def mains_hum(time: np.ndarray, signal: np.ndarray, reading: DecayReading) -> li
             if hertz < low or cycles < _APART:
                 continue
             tone = _steady_tone(time, inside, residual, weight, hertz)
-            if tone is not None:
+            own = _explained(residual, weight, _own_harmonic(carrier, at, hertz))
+            if tone is not None and _explained(residual, weight, tone.unit[inside]) > own:
                 tones.append(tone)
                 residual = residual - tone.wave[inside]
     return tones
@@ -76,5 +81,19 @@ def _steady_tone(
     neighbours = np.abs(line(hertz + np.concatenate([-away, away])))
     if np.abs(lines[best]) < _SURE * np.median(neighbours) / np.sqrt(2 * np.log(2)):
         return None
-    wave = (lines[best] * np.exp(2j * np.pi * near[best] * time)).real
-    return MainsTone(float(near[best]), float(np.abs(lines[best])), wave)
+    unit = np.exp(2j * np.pi * near[best] * time)
+    wave = (lines[best] * unit).real
+    return MainsTone(float(near[best]), float(np.abs(lines[best])), unit, wave)
+
+
+def _own_harmonic(carrier: Carrier, at: np.ndarray, hertz: float) -> np.ndarray:
+    """The harmonic of the decaying mode that is nearest to a frequency on average."""
+    value = carrier.curve()(at)
+    order = max(1.0, np.round(hertz * HERTZ * np.ptp(at) / np.ptp(value.imag)))
+    return np.exp(order * (value - value.real.max()))
+
+
+def _explained(signal: np.ndarray, weight: np.ndarray, wave: np.ndarray) -> float:
+    """Weighted sum of squares that a wave of any amplitude and phase explains."""
+    product = np.abs(np.sum(weight**2 * signal * wave.conj())) ** 2
+    return float(2 * product / np.sum(weight**2 * np.abs(wave) ** 2))

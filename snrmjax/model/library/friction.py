@@ -30,6 +30,7 @@ from snrmjax.model.effect_metadata import (
     Symmetry,
     parameter,
 )
+from snrmjax.model.nonsmooth_points import with_extremes, with_slip_corners
 from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE, InputError
 
 _SLIP = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
@@ -58,24 +59,45 @@ def settled_positions(
     Every position is a sample of q plus or minus x_s, or 0. The index of the sample is computed
     without derivatives and the position then looked up: exact and cheap derivatives.
     """
-    n = displacement.shape[0]
-    q, slip = jax.lax.stop_gradient((displacement, slip_displacement))
+    return _settled(displacement[:, None], slip_displacement)
+
+
+def corrected_positions(
+    displacement: Float[Array, " time"], slip_displacement: Float[Array, " slider"]
+) -> Float[Array, "time slider"]:
+    """`settled_positions` of a cycle that turns between samples, with corners corrected.
+
+    See `with_slip_corners`.
+    """
+    position = _settled(with_extremes(displacement), slip_displacement)
+    correct = jax.vmap(with_slip_corners, (1, None, 0), 1)
+    return correct(position, displacement, slip_displacement)
+
+
+def _settled(
+    path: Float[Array, "time step"], slip_displacement: Float[Array, " slider"]
+) -> Float[Array, "time slider"]:
+    """Positions after every row of displacements."""
+    n = path.size
+    q, slip = jax.lax.stop_gradient((path, slip_displacement))
     untouched = 2 * n
 
     def moved(
         before: tuple[Array, Array], sample: tuple[Array, Array]
     ) -> tuple[tuple[Array, Array], Array]:
-        (position, source), (at, k) = before, sample
-        dragged_up, dragged_down = position < at - slip, position > at + slip
-        source = jnp.where(dragged_up, k, jnp.where(dragged_down, k + n, source))
-        return (jnp.clip(position, at - slip, at + slip), source), source
+        position, source = before
+        for at, k in zip(*sample, strict=True):
+            dragged_up, dragged_down = position < at - slip, position > at + slip
+            source = jnp.where(dragged_up, k, jnp.where(dragged_down, k + n, source))
+            position = jnp.clip(position, at - slip, at + slip)
+        return (position, source), source
 
-    samples = (q, jnp.arange(n, dtype=jnp.int32))
+    samples = (q, jnp.arange(n, dtype=jnp.int32).reshape(path.shape))
     rest = (jnp.zeros_like(slip), jnp.full(slip.shape, untouched, dtype=jnp.int32))
     settled, _ = jax.lax.scan(moved, rest, samples)
     sources: Int[Array, "time slider"]
     _, sources = jax.lax.scan(moved, settled, samples)
-    picked = displacement[jnp.where(sources == untouched, 0, sources % n)]
+    picked = path.reshape(-1)[jnp.where(sources == untouched, 0, sources % n)]
     position = picked + jnp.where(sources < n, -1.0, 1.0) * slip_displacement
     return jnp.where(sources == untouched, 0.0, position)
 
@@ -145,7 +167,7 @@ class AbstractSliders(AbstractHysteresis):
         return settled_positions(displacement, self.sliders().slip_displacement)
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        return self.for_cycle(displacement)._force_on(displacement, settled_positions)
+        return self.for_cycle(displacement)._force_on(displacement, corrected_positions)
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """For a cycle with two turning points."""
@@ -255,9 +277,10 @@ class IwanMicroslip(AbstractSliders):
         return Sliders(stiffness, largest * jnp.asarray(NODE) ** (1 / (p - 1)))
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        half_range = 0.5 * (jnp.max(displacement) - jnp.min(displacement))
-        sliders = self._sliders_up_to(half_range)
-        return settled_positions(displacement, sliders.slip_displacement) @ -sliders.stiffness
+        # Sliders of all displacements: their sum has no corners but where the motion turns.
+        path = with_extremes(displacement)
+        sliders = self._sliders_up_to(0.5 * (jnp.max(path) - jnp.min(path)))
+        return _settled(path, sliders.slip_displacement) @ -sliders.stiffness
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """Masing's rule between two turning points."""

@@ -25,8 +25,8 @@ def _ended(force: float, unit: str, status: Status) -> str:
     return f"force {force:g} {unit}: a curve {status.message}."
 
 
-def _not_followed(status: Status) -> str:
-    return f"the mode {status.message}."
+def _not_followed(to_hz: float, ends_hz: float, status: Status) -> str:
+    return f"the mode ends at {ends_hz:.5g} Hz instead of {to_hz:.5g} Hz: it {status.message}."
 
 
 def _equilibria(
@@ -49,12 +49,25 @@ def _load(force: float, drive: float | None, at: str | None = None, unit: str = 
 
 
 def _no_stable_response(
-    force: float, unit: str, from_hz: float, to_hz: float, isolated: bool
+    force: float,
+    unit: str,
+    from_hz: float,
+    to_hz: float,
+    isolated: bool,
+    wells: int = 1,
+    doublings_hz: Sequence[float] = (),
 ) -> str:
     further = "" if isolated else "; `--isolated` searches for further responses"
+    if wells > 1 and not isolated:
+        further = "; motions across several wells were not searched: `--isolated` does"
+    doubled = "".join(
+        f" Period doubling at {hertz:.5g} Hz: the stable motion there repeats after two periods of "
+        "the force, which this harmonic balance does not represent."
+        for hertz in doublings_hz
+    )
     return (
         f"force {force:g} {unit}: no stable response with the period of the force was found from "
-        f"{from_hz:.5g} to {to_hz:.5g} Hz: a sweep leaves the curves there{further}."
+        f"{from_hz:.5g} to {to_hz:.5g} Hz: a sweep leaves the curves there{further}.{doubled}"
     )
 
 

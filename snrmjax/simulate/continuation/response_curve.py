@@ -260,6 +260,19 @@ def _truncation_errors(
     return by_member(_truncations, balances, owner, coefficients, frequency)
 
 
+def period_doublings(curves: Sequence[ResponseCurve]) -> list[float]:
+    """Frequencies (rad/s) at which motions lose their stability to ones of twice the period.
+
+    One for several curves that are mirror images of each other.
+    """
+    found: list[float] = []
+    for curve in curves:
+        for event in curve.frequency[curve.at_events(CurveEvent.PERIOD_DOUBLING)].tolist():
+            if not np.any(np.abs(np.array(found) / event - 1) < _NARROW):
+                found.append(event)
+    return sorted(found)
+
+
 def without_stable_response(
     curves: Sequence[ResponseCurve], from_frequency: float, to_frequency: float
 ) -> list[tuple[float, float]]:

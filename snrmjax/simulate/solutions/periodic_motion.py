@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.newton import ROUNDING, Point, newton
 from snrmjax.numerics.result import AbstractResult, Variable
@@ -52,6 +53,7 @@ class PeriodicMotion(AbstractResult):
         )
 
 
+@on_one_core
 def periodic_motion(
     model: Structure,
     force: float | Float[ArrayLike, ""],
@@ -68,7 +70,8 @@ def periodic_motion(
     of interest ("phase_resonance"), s being the arclength of the response curve, by Newton's
     method with exact derivatives. The result is a differentiable function of every number of
     `model`, of `force` and of `value`, by the implicit function theorem: in forward and in reverse
-    mode, and of second order (a Hessian times a vector is `jax.jvp` of `jax.grad`). `start`
+    mode, and of second order (a Hessian times a vector is `jax.jvp` of `jax.grad`; that of a "peak"
+    or a "fold" of a structure with contacts compiles for a minute or two, once). `start`
     (coefficients in kg^1/2 m and frequency in rad/s, such as `ResponseCurve.point`) only selects
     the solution: derivatives by it are zero.
 
@@ -76,9 +79,9 @@ def periodic_motion(
     Returns a `PeriodicMotion`, also under `jax.jit` and `jax.vmap` (models with the same modes,
     monomials and effects; all take as many iterations as the slowest). If Newton's method did not
     converge its values and their derivatives are NaN: start nearer, or use `TrackedMotion`.
-    With sliders and contacts the slope of the response jumps where one of the time samples begins
-    to slip or to touch, so that "peak" and "fold" may not converge from any start: take
-    "phase_resonance", "frequency" or "velocity" there.
+    With sliders and contacts the slope of the response changes fast where the motion begins to
+    slip or to touch: if "peak" or "fold" does not converge there, take "phase_resonance",
+    "frequency" or "velocity".
     Members of a batch that a result leaves out add nothing to its derivatives; mask them before
     further computation, by `jnp.where(motion.converged, motion.frequency, 1.0)`. From a distant
     start Newton's method may converge to another motion: in an optimisation use `TrackedMotion`.

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import snrmjax as sj
 from snrmjax.pipelines.simulate import simulate_responses
@@ -102,6 +103,27 @@ def test_each_stable_rest_has_its_response():
     # Under the force reversed in time by half a period the wells are exchanged.
     peaks = [np.abs(c.velocity[:, 1, 0]).max() for c in (here, there)]
     assert peaks[0] == pytest.approx(peaks[1], rel=1e-4)
+
+
+def test_period_doubling_and_motions_across_wells_are_named_where_no_motion_is_stable():
+    """ÿ + 0.1ẏ − y/2 + y³/2 = 0.3 cos Ωt about y = 1, whose settled motion at 0.1 Hz is ±1.8."""
+    modes = sj.model.linear_modes([1.0], [0.05], [[1.0]], [1.0])
+    wells = sj.model.polynomial_potential({(0, 0, 0): 0.5, (0, 0, 0, 0): 0.125}, 1)
+    found = simulate_responses(sj.model.structure(modes, wells), [0.3], 0.1, 0.25, harmonics=5)
+    (left,) = [note for note in found.notes if note.kind == "no_stable_response"]
+    (doubling,) = left["doublings_hz"]
+    assert doubling == left["to_hz"]
+    assert left["wells"] == 2
+
+    def rate(at, y):
+        force = 0.3 * np.cos(HERTZ * at / period)
+        return [y[1], force - 0.1 * y[1] + 0.5 * y[0] - 0.5 * y[0] ** 3]
+
+    # Just below it the motion repeats after two periods and not after one.
+    period = 1 / (doubling * 0.995)
+    at = (300 + np.arange(3)) * period
+    settled = solve_ivp(rate, (0, at[-1]), [1.0, 0.0], t_eval=at, rtol=1e-8, atol=1e-8).y[0]
+    assert abs(settled[2] - settled[0]) < 1e-3 < 0.02 < abs(settled[1] - settled[0])
 
 
 def settled_velocity(force, hertz, cycles=20, steps=64):

@@ -166,6 +166,34 @@ def test_gradients_of_the_flat_beam(flat_curve):
     np.testing.assert_allclose(slope / largest, gradient / largest, rtol=0, atol=1e-9)
 
 
+def test_the_peak_of_a_sliding_structure_is_its_largest_response():
+    settings = {"stiffness": 0.8, "slip_displacement": 0.3}
+    model = oscillator(make_effect("jenkins_slider", settings))
+    curve = forced_response(model, [FORCE], 1.5, 3.5, harmonic_order=5, stability=False)[0]
+    (k,) = curve.at_events("peak")
+    coefficients, frequency = curve.point(k)
+    largest = int(np.argmax(np.abs(curve.velocity[:, 1, 0])))
+    start = curve.point(largest - 1)
+    found = periodic_motion(model, FORCE, start, condition="peak")
+    assert bool(found.converged)
+    step = 2e-3
+    near = [
+        float(
+            periodic_motion(
+                model, FORCE, (coefficients, frequency), value=frequency * (1 + k * step)
+            ).amplitude
+        )
+        for k in (-1, 0, 1)
+    ]
+    # The parabola through three frequencies around it; its error is of third order in their step.
+    slope, second = (near[2] - near[0]) / 2, near[2] - 2 * near[1] + near[0]
+    vertex = frequency * (1 - step * slope / second)
+    assert float(found.frequency) == pytest.approx(vertex, rel=step**2 * 10)
+    assert float(found.amplitude) == pytest.approx(
+        near[1] - slope**2 / second / 2, rel=step**3 * 10
+    )
+
+
 # ----------------------------------------------------------------------------------- exact ones
 
 
