@@ -135,7 +135,7 @@ def _read(text: str, file: str, path: Path) -> Structure:
 def _check_point(modes: LinearModes, point: str, location: str) -> None:
     try:
         modes.shape_at(point)
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{location} cannot be read: {error}") from error
 
 
@@ -276,7 +276,7 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
     for name, value in table.entries.items():
         try:
             monomial = parse_monomial(name, n_modes)
-        except ValueError as error:
+        except InputError as error:
             raise InputError(f"{table.location} cannot be read: {error}") from error
         if monomial in coefficients:
             twice = f"{table.location} has the monomial {name!r} twice"
@@ -320,7 +320,7 @@ def _effect(table: TomlTable) -> AbstractEffect:
             at=influence_vector_of(table),
             normal_at=influence_vector_of(table, "normal_"),
         )
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{table.location} cannot be read: {error}") from error
 
 

@@ -63,7 +63,7 @@ def structure_of_matrices(
         raise table.refusal("points", "a list of names, one for each unknown", points)
     try:
         check_names(points, matrices["mass"].shape[0])
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{table.location} cannot be read: {error}") from error
     damping: Any = matrices.get("damping")
     if "damping_ratio" in parts:
@@ -103,7 +103,7 @@ def structure_of_matrices(
             sensors=sensors,
             name=top.text("name", folder.stem),
         )
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{table.location} cannot be read: {error}") from error
     of_interest = top.whole("mode_of_interest", 1, 1)
     if of_interest > built.n_modes:

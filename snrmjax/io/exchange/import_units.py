@@ -12,6 +12,7 @@ from snrmjax.io.laboratory.physical_units import (
     UnitMeaning,
     amplitude_kind,
     level_reference,
+    meaning_or_none,
     unit_meaning,
 )
 from snrmjax.measure.recordings.channels import DERIVATIVE, SI_UNIT, Quantity
@@ -133,7 +134,7 @@ def motion_meaning(
         example = f"{channel}:{of}:{SI_UNIT[of]}"
         others = ", or --unit for all responses" if option == "--response" else ""
         raise InputError(f"in which unit is {channel}? State it: {option} {example}{others}.")
-    stated_meaning = _meaning_or_none(stated)
+    stated_meaning = meaning_or_none(stated)
     is_per_force = stated_meaning is not None and stated_meaning.per_force
     if is_per_force and (over is None or over.is_voltage or over.motion is not None):
         way = "give --over-force, with the force's column or amplitude in a unit of force"
@@ -143,7 +144,7 @@ def motion_meaning(
     below = 1.0 if over is None or is_per_force else over.factor
     if over is not None and not is_per_force and "/" in stated:
         numerator, _, divisor = (part.strip("() ") for part in stated.rpartition("/"))
-        divisor_meaning = _meaning_or_none(divisor)
+        divisor_meaning = meaning_or_none(divisor)
         if divisor_meaning is not None and divisor_meaning.dimension == over.dimension:
             stated, below = numerator, divisor_meaning.factor
     meaning = _meaning(stated, "--unit")
@@ -248,15 +249,8 @@ def phase_in_rad(
     return sign * (np.radians(values) if unit == "deg" else values)
 
 
-def _meaning_or_none(unit: str) -> UnitMeaning | None:
-    try:
-        return unit_meaning(unit)
-    except ValueError:
-        return None
-
-
 def _meaning(unit: str, option: str) -> UnitMeaning:
     try:
         return unit_meaning(unit)
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{str(error).rstrip('.')}: {option} states it.") from error

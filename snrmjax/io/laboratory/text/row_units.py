@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.io.files import shown
-from snrmjax.io.laboratory.physical_units import level_reference, unit_meaning
+from snrmjax.io.laboratory.physical_units import level_reference, meaning_or_none, unit_meaning
 from snrmjax.io.laboratory.text.fields import SEPARATORS, fields_of
 from snrmjax.numerics.rules import InputError
 
@@ -50,12 +50,8 @@ def _parts(field: str) -> tuple[str, str] | None:
     match = _NUMBER_AND_UNIT.fullmatch(field)
     if match is None:
         return None
-    try:
-        if level_reference(match[2]) is None:
-            unit_meaning(match[2])
-    except InputError:
-        return None
-    return match[1], match[2]
+    known = level_reference(match[2]) is not None or meaning_or_none(match[2]) is not None
+    return (match[1], match[2]) if known else None
 
 
 def columns_in_one_unit(

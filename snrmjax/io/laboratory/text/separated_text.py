@@ -12,7 +12,7 @@ from snrmjax.io.laboratory.arrays.structs import read_struct
 from snrmjax.io.laboratory.arrays.value_tree import Node, in_memory
 from snrmjax.io.laboratory.contents import LaboratoryFile, TextFormat
 from snrmjax.io.laboratory.names import Label, label_of, role_of
-from snrmjax.io.laboratory.physical_units import level_reference, unit_meaning
+from snrmjax.io.laboratory.physical_units import level_reference, meaning_or_none
 from snrmjax.io.laboratory.text.columns import read_columns
 from snrmjax.io.laboratory.text.fields import (
     SEPARATORS,
@@ -115,11 +115,10 @@ def _metadata_above(lines: Sequence[str], separator: str, decimal: str) -> _Tabl
         quantity = number_in(number, decimal, thousands=True)
         quantity = number_in(number, "point") if quantity is None else quantity
         unit = unit.strip() or label_of(key).unit or ("Hz" if role == "rate" else "s")
-        try:
-            meaning = unit_meaning(unit)
-        except ValueError:
+        meaning = meaning_or_none(unit)
+        if meaning is None or quantity is None or quantity <= 0:
             continue
-        if quantity is None or quantity <= 0 or meaning.dimension not in ("frequency", "time"):
+        if meaning.dimension not in ("frequency", "time"):
             continue
         is_rate = meaning.dimension == "frequency"
         factor = meaning.factor / HERTZ if is_rate else meaning.factor
@@ -328,10 +327,7 @@ def _repeated(names: Sequence[str], fewest: int) -> int:
 def _all_units(fields: list[str]) -> bool:
     """Whether all fields of a row are units or empty, with letters in at least one."""
     for field in fields:
-        if level_reference(field.strip("()")) is not None:
-            continue
-        try:
-            unit_meaning(field.strip("()"))
-        except ValueError:
+        unit = field.strip("()")
+        if level_reference(unit) is None and meaning_or_none(unit) is None:
             return False
     return any(re.search("[A-Za-z]", field) for field in fields)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.io.laboratory.physical_units import unit_meaning
+from snrmjax.io.laboratory.physical_units import meaning_or_none
 from snrmjax.io.laboratory.uff.data_sets import stated
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.units import HERTZ
@@ -29,9 +29,8 @@ class EvenAbscissa(NamedTuple):
 def in_si(function: Mapping[str, Any], notes: list[Fact]) -> Mapping[str, Any]:
     """A function with its abscissa in s or Hz, as its unit label states (ms, kHz, rad/s, rpm)."""
     label = stated(function.get("abscissa_axis_units_lab", ""))
-    try:
-        meaning = unit_meaning(label)
-    except ValueError:
+    meaning = meaning_or_none(label)
+    if meaning is None:
         return function
     factor = meaning.factor / _SI.get(meaning.dimension, meaning.factor)
     if abs(factor - 1) < 1e-12:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from snrmjax.io.laboratory.physical_units import is_per_force, level_reference, unit_meaning
+from snrmjax.io.laboratory.physical_units import is_per_force, level_reference, meaning_or_none
 from snrmjax.io.laboratory.uff.data_sets import stated
 from snrmjax.measure.recordings.channels import SI_UNIT, Quantity
 from snrmjax.numerics.facts import Fact
@@ -71,9 +71,8 @@ def axis_unit(function: Mapping[str, Any], axis: str, units: UnitSystem) -> Axis
         )
     if level_reference(label) is not None:
         return AxisUnit("unknown", label, 1.0)
-    try:
-        meaning = unit_meaning(label)
-    except ValueError:
+    meaning = meaning_or_none(label)
+    if meaning is None:
         return AxisUnit(quantity, label, 1.0, (Fact("unit_unknown", unit=label),))
     if meaning.quantity == "unknown" or meaning.per_volt:
         return AxisUnit(quantity, label, meaning.factor if meaning.dimension == "other" else 1.0)
