@@ -20,7 +20,7 @@ from .pointwise.inversion import closed_form, invert_amplitude_phase, invert_pha
 from .pointwise.inversion_result import PointStatus
 from .pointwise.prediction import predict_response, resonances
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
-from .prediction.new_level import ON_THE_CURVES, DayToDay, new_level
+from .prediction.new_level import WITHOUT_LEVEL_ERRORS, DayToDay, new_level
 from .scaling.scale import (
     AddedMassTest,
     Calibration,
@@ -33,7 +33,7 @@ from .scaling.scale import (
 
 __all__ = [
     "FAMILIES",
-    "ON_THE_CURVES",
+    "WITHOUT_LEVEL_ERRORS",
     "AddedMassTest",
     "Backbone",
     "Calibration",

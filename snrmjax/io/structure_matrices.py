@@ -84,7 +84,7 @@ def structure_of_matrices(
     _check_named(points, sensors or (), f"`points` in [sensors] of {file}")
     _check_named(points, dict(base.along if base else ()), f"`along` in [base] of {file}")
     for k, effect in enumerate(effects, 1):
-        vectors = effect.rows if isinstance(effect, AbstractForce) else ()
+        vectors = effect.influence_vectors if isinstance(effect, AbstractForce) else ()
         named = [point for vector in vectors if vector is not None for point, _ in vector]
         _check_named(points, named, f"effect {k} of {file}")
     try:
@@ -160,7 +160,9 @@ def element_participation(
 ) -> np.ndarray:
     """Participation wᵀφ of rigid-body modes in each nonlinear element, (element, mode)."""
     forces = [effect for effect in effects if isinstance(effect, AbstractForce)]
-    vectors = [dict(vector) for force in forces for vector in force.rows if vector is not None]
+    vectors = [
+        dict(vector) for force in forces for vector in force.influence_vectors if vector is not None
+    ]
     weights = np.array([[vector.get(name, 0.0) for name in names] for vector in vectors])
     return weights.reshape(-1, len(names)) @ rigid
 

@@ -100,7 +100,7 @@ class Comparison(NamedTuple):
     @property
     def reference(self) -> MethodResult | None:
         """The result that distances refer to: the inverse SNRM, else the first with points."""
-        results = [result for result in self.results if result.found.any()]
+        results = [result for result in self.results if result.has_result.any()]
         return next((r for r in results if r.method == "snrm"), results[0] if results else None)
 
     def distances(self) -> tuple[Distance, ...]:
@@ -108,15 +108,15 @@ class Comparison(NamedTuple):
         reference = self.reference
         if reference is None:
             return ()
-        at = np.asarray(reference.velocity)[reference.found]
+        at = np.asarray(reference.velocity)[reference.has_result]
         distances = []
         for result in self.results:
             velocity = np.asarray(result.velocity)
-            kept = result.found & (velocity >= at.min()) & (velocity <= at.max())
+            kept = result.has_result & (velocity >= at.min()) & (velocity <= at.max())
             if not kept.any():
                 continue
             omega, ratio = (
-                np.interp(velocity[kept], at, np.asarray(curve)[reference.found])
+                np.interp(velocity[kept], at, np.asarray(curve)[reference.has_result])
                 for curve in (reference.natural_frequency, reference.damping_ratio)
             )
             off = np.abs(np.asarray(result.natural_frequency)[kept] - omega)
@@ -177,7 +177,7 @@ def compare_methods(
     stopped = {name: f"{name}: {why}" for name, why in (stopped | absent).items()}
     if not results:
         raise InputError(f"no method could run; {next(iter(stopped.values()), 'none was given.')}")
-    if not any(result.found.any() for result in results):
+    if not any(result.has_result.any() for result in results):
         why = MethodStatus(int(results[0].status[0])).message
         raise InputError(f"no method gave a point; {results[0].method}: {why}.")
     return Comparison(

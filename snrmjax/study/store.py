@@ -177,7 +177,7 @@ def _write_store(
     _write_labels(group, ensemble)
     axes = study.computation.axes()
     sizes = {MEMBER: len(ensemble.table), **{name: len(axis.values) for name, axis in axes.items()}}
-    sensor = study.sensor_told
+    sensor = study.reported_sensor
     outputs = {
         name: one._replace(meaning=f"{one.meaning}, at {sensor}") if one.at_sensor else one
         for name, one in study.computation.outputs().items()

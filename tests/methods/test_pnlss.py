@@ -102,7 +102,7 @@ def backbone(velocity):
 def test_mode_of_a_duffing_oscillator_from_three_realisations(motion):
     records = [multisine(0.5, seed, motion=motion) for seed in (0, 1, 2)]
     result = sj.methods.pnlss(records, "force", "tip")
-    assert result.found.all()
+    assert result.has_result.all()
     # Four of the fit's 1σ, and for frequency the truncation error of one-term harmonic balance.
     off = np.asarray(result.natural_frequency) - backbone(np.asarray(result.velocity))
     assert np.all(np.abs(off) < 4 * np.asarray(result.natural_frequency_std) + 3e-5 * REST)
@@ -155,7 +155,7 @@ def test_realisations_and_levels_of_one_test_are_one_model():
     (result,) = sj.methods.compare_methods(records, modes, ["pnlss"]).results
     assert [n["n"] for n in result.notes if n.kind == "one_model_of_records"] == [3]
     assert result.notes[0]["validation"] < 0.05
-    assert result.found.sum() == 25
+    assert result.has_result.sum() == 25
     off = np.asarray(result.natural_frequency) - backbone(np.asarray(result.velocity))
     assert np.all(np.abs(off) < 4 * np.asarray(result.natural_frequency_std) + 3e-5 * REST)
 

@@ -91,7 +91,7 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
     velocity = np.asarray(result.velocity)
     reference = decay_of_mode(decay)
     inside = (
-        reference.found
+        reference.has_result
         & (reference.velocity >= np.nanmin(velocity))
         & (reference.velocity <= np.nanmax(velocity))
     )
@@ -109,7 +109,9 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
         std = std * np.maximum(1.0, growth * decay.noise_std / manifold.slow_std)
         here, here_std = (
             np.interp(
-                np.asarray(reference.velocity)[inside], velocity[result.found], one[result.found]
+                np.asarray(reference.velocity)[inside],
+                velocity[result.has_result],
+                one[result.has_result],
             )
             for one in (value, std)
         )
@@ -121,16 +123,16 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
 def _curves_at(decay: IsolatedDecay, velocity: np.ndarray) -> list[list[np.ndarray]]:
     """Frequency and damping of `decay_of_mode` with their 1σ, at some amplitudes."""
     read = decay_of_mode(decay)
-    known, at = np.log(np.asarray(read.velocity)[read.found]), np.log(velocity)
+    known, at = np.log(np.asarray(read.velocity)[read.has_result]), np.log(velocity)
     return [
-        [np.interp(at, known, np.asarray(getattr(read, f"{name}{end}"))[read.found])
+        [np.interp(at, known, np.asarray(getattr(read, f"{name}{end}"))[read.has_result])
          for end in ("", "_std")]
         for name in ("natural_frequency", "damping_ratio")
     ]  # fmt: skip
 
 
 def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
-    omega = np.asarray(result.natural_frequency)[result.found]
+    omega = np.asarray(result.natural_frequency)[result.has_result]
     low, high = decay.band
     if omega.size and (omega.min() < low or omega.max() > high):
         raise InputError(
@@ -139,7 +141,8 @@ def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
             "method follows another motion."
         )
     ratio, std = (
-        np.asarray(one)[result.found] for one in (result.damping_ratio, result.damping_ratio_std)
+        np.asarray(one)[result.has_result]
+        for one in (result.damping_ratio, result.damping_ratio_std)
     )
     if ratio.size and np.nanmedian(std / ratio) > UNDETERMINED:
         raise InputError(

@@ -91,5 +91,6 @@ def is_mark(name: str, array: Numbers) -> bool:
 def in_hertz(unit: str) -> float:
     """Factor from a unit to Hz; 1 for a unit of another quantity."""
     meaning = meaning_or_none(unit)
-    known = meaning is not None and meaning.dimension == "frequency"
-    return meaning.factor / HERTZ if known else 1.0
+    if meaning is None or meaning.dimension != "frequency":
+        return 1.0
+    return meaning.factor / HERTZ
