@@ -11,7 +11,7 @@ import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
 from snrmjax.methods.records.state_space import StateSpace, hold, modal_constant, monomials
 from snrmjax.methods.records.state_space import response as model_response
-from snrmjax.methods.records.state_space_fit import _order
+from snrmjax.methods.records.state_space_fit import _order, fit_state_space
 from snrmjax.methods.records.state_space_start import linear_terms, subspace_poles
 
 REST, RATIO, CUBIC, MASS = 2 * np.pi * 40.0, 0.01, 6e9, 0.5  # rad/s, 1, 1/(m² s²), kg
@@ -131,7 +131,7 @@ def test_what_cannot_be_fitted_is_refused():
         channels = [Channel("force", "force"), Channel("tip", "velocity")]
         return time_recording(np.stack([force_samples, values]), channels, rate)
 
-    fit = sj.methods.fit_state_space
+    fit = fit_state_space
     with pytest.raises(ValueError, match="`order` must be 2, 4 or 6"):
         fit(record(moved), "force", "tip", order=3)
     with pytest.raises(ValueError, match="`degrees` must lie between 2 and 7"):

@@ -9,6 +9,7 @@ from truths import two_modes
 from truths.chain_states import steady_states, structure
 
 import snrmjax as sj
+from snrmjax.diagnose.location.where import EVERYWHERE
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.io.diagnosis_results import placed_answer, summarise_localisation
 from snrmjax.pipelines.diagnose import DiagnosedTest
@@ -82,7 +83,7 @@ def test_one_sensor_locates_it_by_the_law():
 def test_a_force_on_the_mode_is_everywhere():
     data = two_modes.steady_states({(4, 0): 2e4}, noise=3e-3, seed=2)
     found = sj.diagnose.locate_force(data, two_modes.structure(), laws=LAWS)
-    assert found.candidates[0].name == sj.diagnose.EVERYWHERE
+    assert found.candidates[0].name == EVERYWHERE
     assert found.told
     assert not found.explains
 
