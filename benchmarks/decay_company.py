@@ -24,7 +24,7 @@ from scipy.interpolate import CubicSpline
 
 import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
-from snrmjax.methods.record_comparison import run_record_method
+from snrmjax.methods.comparison import run_record_method
 from snrmjax.methods.records.recorded_test import recorded_test
 from snrmjax.numerics.rules import InputError
 

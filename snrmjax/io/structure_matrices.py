@@ -13,7 +13,7 @@ import scipy.sparse
 from jaxtyping import Float
 
 from snrmjax.io.files import shown
-from snrmjax.io.laboratory.arrays.matlab_elements import checked_variables
+from snrmjax.io.laboratory.arrays.matlab_files import checked_variables
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.io.toml_table import TomlTable
 from snrmjax.model.attachment import InfluenceVector, between, influence_vector

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.beam_description import RADIUS, RISE
 from snrmjax.condense.beam_models import BeamModels
-from snrmjax.condense.beam_parameters import beam_rules, check_beam_name
+from snrmjax.condense.beam_parameters import RADIUS, RISE, beam_rules, check_beam_name
 from snrmjax.model.parameters import (
     parameter_names,
     parameter_rules,

@@ -35,8 +35,7 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.least_squares import inverse_of
-from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, inverse_of
 from snrmjax.numerics.names import with_former_arguments
 from snrmjax.numerics.rules import InputError
 

@@ -20,7 +20,7 @@ from snrmjax.identify.pointwise.backbone_points import (
     off_resonance_error_factor,
     peak_ratio,
 )
-from snrmjax.identify.pointwise.inversion_result import PointStatus, reasons_in_words
+from snrmjax.identify.pointwise.inversion import PointStatus, reasons_in_words
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes

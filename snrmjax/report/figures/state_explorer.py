@@ -13,7 +13,7 @@ from snrmjax.identify.inference.identification import Identification
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
-from snrmjax.pipelines.folded_records import FoldedRecord
+from snrmjax.pipelines.whole_test import FoldedRecord
 from snrmjax.report.figures.live import (
     legend_at_right,
     live_figures,

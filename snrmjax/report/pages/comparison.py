@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.tables import write_table
-from snrmjax.methods.comparison import METHODS, Comparison
-from snrmjax.methods.record_comparison import RECORD_METHODS
+from snrmjax.methods.comparison import METHODS, RECORD_METHODS, Comparison
 from snrmjax.methods.result import MethodResult, MethodStatus
 from snrmjax.numerics.units import HERTZ
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, number, write_report

@@ -33,8 +33,13 @@ from snrmjax.report.figures.diagnosis import (
     found_effects,
     misfit_figure,
 )
-from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
-from snrmjax.report.figures.parts import PARTS_CAPTION, parts_figure
+from snrmjax.report.figures.parts import (
+    LAW_CAPTION,
+    PARTS_CAPTION,
+    drawn_laws_figure,
+    law_tables,
+    parts_figure,
+)
 from snrmjax.report.html import (
     PROGRAM,
     Report,

@@ -13,8 +13,7 @@ from snrmjax.io.laboratory.arrays.value_tree import (
 )
 from snrmjax.io.laboratory.names import label_of, role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference, meaning_or_none
-from snrmjax.io.laboratory.printed_times import rate_of_printed_times
-from snrmjax.io.laboratory.uneven_times import odd_step, resampled
+from snrmjax.io.laboratory.printed_times import odd_step, rate_of_printed_times, resampled
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
