@@ -34,7 +34,7 @@ def test_sensors_locate_the_force_without_a_law(law):
     data, model = steady_states(INFLUENCE, law, sensors), structure(sensors)
     candidates = ("x1", "x2", "x3", "x4", "x2-x1", "x3-x2", "x4-x3")
     found = sj.diagnose.locate_force(data, model, candidates, laws=LAWS)
-    assert found.told
+    assert found.is_determined
     assert found.candidates[0].name == "x3-x2"
     assert found.probability.sum() == pytest.approx(1.0, abs=1e-12)
     # The residual is noise: 18 states of 5 orders and 3 sensors, 1σ of the root about 0.04.
@@ -84,7 +84,7 @@ def test_a_force_on_the_mode_is_everywhere():
     data = two_modes.steady_states({(4, 0): 2e4}, noise=3e-3, seed=2)
     found = sj.diagnose.locate_force(data, two_modes.structure(), laws=LAWS)
     assert found.candidates[0].name == EVERYWHERE
-    assert found.told
+    assert found.is_determined
     assert not found.explains
 
 
