@@ -24,7 +24,7 @@ from scipy.interpolate import CubicSpline
 
 import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
-from snrmjax.methods.record_comparison import run_record_method
+from snrmjax.methods.comparison import run_record_method
 from snrmjax.methods.records.recorded_test import recorded_test
 from snrmjax.numerics.rules import InputError
 
@@ -174,7 +174,7 @@ def case(seed, number):
 def scored(result, truth):
     """Relative errors of frequency and damping over 1σ and by themselves, where truth reaches."""
     at = np.asarray(result.velocity)
-    kept = result.found & (at > truth[0, 0]) & (at < truth[0, -1])
+    kept = result.has_result & (at > truth[0, 0]) & (at < truth[0, -1])
     rows = []
     for row, found, std in (
         (1, result.natural_frequency, result.natural_frequency_std),
@@ -206,7 +206,7 @@ def main() -> None:
                 result, why = found.result, found.reason
             except InputError as error:
                 result, why = None, str(error)
-            if result is None or not result.found.any():
+            if result is None or not result.has_result.any():
                 refused[name][one.close] += 1
                 if given.show:
                     print("   ", name, "refused:", why or "no point")

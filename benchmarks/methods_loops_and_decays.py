@@ -26,7 +26,7 @@ from methods_table import STRUCTURES, line_of, scored, truth_of
 
 import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
-from snrmjax.methods.record_comparison import run_record_method
+from snrmjax.methods.comparison import run_record_method
 from snrmjax.methods.records.recorded_test import recorded_test
 
 tell = teller(__file__)

@@ -106,7 +106,7 @@ def resonant_decay(folder: Path | None) -> None:
 
 def _answer(result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Amplitude, frequency (Hz) and damping ratio where there is an answer."""
-    good = result.found
+    good = result.has_result
     return (
         np.asarray(result.velocity)[good],
         np.asarray(result.natural_frequency)[good] / HERTZ,
@@ -131,7 +131,7 @@ def phase_locked_loop() -> None:
     truth = sj.simulate.phase_controlled(model, 1.7e-2)
     speed = np.abs(truth.velocity[:, 1, 0])
     order = np.argsort(speed)
-    good = found.found
+    good = found.has_result
     true = np.interp(found.velocity[good], speed[order], truth.frequency[order])
     omega = np.asarray(found.natural_frequency)[good]
     said(
@@ -199,7 +199,7 @@ def response_controlled() -> None:
     model, sizes = duffing(), np.array([4e-4, 8e-4, 1.2e-3, 1.6e-3])
     data = held_displacements(model, sizes)
     found = sj.methods.rct(data, model.modes)
-    good = found.found
+    good = found.has_result
     size = np.asarray(found.velocity)[good] / np.asarray(found.natural_frequency)[good]
     true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
     ratios = np.array([_circle(data, level) for level in np.asarray(found.level)[good]])
@@ -300,7 +300,7 @@ def concerto() -> None:
     )
     data = test.steady_states
     found = sj.methods.concerto(data, model.modes)
-    good = found.found
+    good = found.has_result
     size = np.asarray(found.velocity)[good] / np.asarray(found.natural_frequency)[good]
     omega = np.asarray(data.frequency)
     alpha = np.asarray(data.velocity)[:, 0] / (1j * omega) / np.asarray(data.force)
@@ -388,7 +388,7 @@ def spring_in_a_chain() -> None:
         "Arslan, Aykan & Özgüven, Mech. Syst. Signal Process. 25 (2011) 1112, "
         "doi:10.1016/j.ymssp.2010.10.010: nonlinearity matrix and describing function, written out "
         "here in matrices (their examples' numbers were not found)",
-        states=int(np.sum(result.found)),
+        states=int(np.sum(result.has_result)),
         of=len(omega),
         largest_shift=float(mode[:, 0].max() / np.sqrt(squares[0]) - 1),
         describing_function_difference_max=float(np.abs(v - theirs).max() / np.abs(theirs).max()),

@@ -126,7 +126,7 @@ Row = tuple[float, float, float, float]  # errors of frequency and damping, rela
 def scored(one: object, true: np.ndarray, laws: list) -> list[Row]:
     """Errors of a method's points between the lowest and the highest true resonance."""
     at = np.asarray(one.velocity)
-    good = one.found & (at >= true[0, 0]) & (at <= true[0, -1])
+    good = one.has_result & (at >= true[0, 0]) & (at <= true[0, -1])
     omega, ratio = np.sqrt(laws[0](at[good] ** 2)), laws[1](at[good] ** 2)
     off = np.asarray(one.natural_frequency)[good] - omega
     away = np.asarray(one.damping_ratio)[good] - ratio

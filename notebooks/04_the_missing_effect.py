@@ -109,8 +109,8 @@ plot.comparison_figure(predicted.before, predicted.after, test.steady_states)
 print("velocity at resonance (m/s): measured, before, completed")
 for row in predicted.levels:
     values = (row.measured.velocity, row.before.velocity, row.after.velocity)
-    print(f"level {row.level}:", *(f"{v:.4f}" for v in values), "left out" * row.held_out)
-left_out = [row for row in predicted.levels if row.held_out]
+    print(f"level {row.level}:", *(f"{v:.4f}" for v in values), "left out" * row.withheld)
+left_out = [row for row in predicted.levels if row.withheld]
 headline["resonances of levels left out predicted within 0.1 Hz and 2 %"] = all(
     abs(row.after.frequency - row.measured.frequency) < 0.1
     and abs(row.after.velocity / row.measured.velocity - 1) < 0.02

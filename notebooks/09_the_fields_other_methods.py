@@ -88,7 +88,7 @@ true_ratio = (
 
 def errors_of(one):
     """Velocity, error of frequency (%) and of damping (%) at a method's own points."""
-    kept = one.found & (one.velocity > true_speed[0]) & (one.velocity < true_speed[-1])
+    kept = one.has_result & (one.velocity > true_speed[0]) & (one.velocity < true_speed[-1])
     speed = np.asarray(one.velocity)[kept]
     exactly = [np.interp(speed, true_speed, law) for law in (true_omega, true_ratio)]
     found = (np.asarray(one.natural_frequency)[kept], np.asarray(one.damping_ratio)[kept])
@@ -236,7 +236,7 @@ print(
 headline |= {
     "open loop: two answers at some frequency": bool(np.max(speed_up / speed_down) > 1.5),
     "phase-locked loop within 0.05 % of the exact resonances": bool(misses_loop.max() < 5e-4),
-    "every phase around the fold is held": bool(around.held.all()),
+    "every phase around the fold is held": bool(around.on_target.all()),
     "the S-curve's falling part is held": falling >= 1,
 }
 
@@ -293,7 +293,7 @@ exactly = truth.frequency, truth.damping_ratio
 print("largest error between 0.05 and 0.5 m/s:  frequency (%)   damping (%)")
 worst = {}
 for k, (name, one) in enumerate(read.items()):
-    kept = one.found & (one.velocity > 0.05) & (one.velocity < 0.5)
+    kept = one.has_result & (one.velocity > 0.05) & (one.velocity < 0.5)
     at = np.asarray(one.velocity)[kept]
     values = np.asarray(one.natural_frequency)[kept], np.asarray(one.damping_ratio)[kept]
     off = [

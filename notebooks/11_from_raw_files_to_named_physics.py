@@ -147,12 +147,12 @@ plot.candidates_figure(found)
 gap = found.gap
 print(f"misfit over noise: {gap.before:.2f} before, {gap.after:.2f} after")
 predicted = sj.diagnose.predict_levels(found, model)
-for row in (row for row in predicted.levels if row.held_out):
+for row in (row for row in predicted.levels if row.withheld):
     print(f"level {row.level}, left out, at {row.force:.2f} N:")
     seen = (("measured", row.measured), ("linear", row.before), ("completed", row.completed))
     for name, one in seen:
         print(f"   {name:10s} {one.frequency:.2f} Hz, {one.velocity:.3f} m/s")
-left_out = [row for row in predicted.levels if row.held_out]
+left_out = [row for row in predicted.levels if row.withheld]
 headline[
     "levels left out: velocity at resonance within 10 %, where the linear model is off by more"
 ] = all(

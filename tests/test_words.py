@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import snrmjax as sj
+from snrmjax.model.modes import OptionalModalData
 
 PACKAGE = Path(__file__).resolve().parents[1] / "snrmjax"
 PAGES = Path(__file__).resolve().parents[1] / "notebooks" / "site" / "pages"
@@ -21,8 +22,8 @@ RETIRED = {
 }
 # In texts "to share" is a verb and no part of a whole.
 IN_TEXTS = RETIRED - {"share", "shares"}
-# Names of others, and arguments of public functions that keep their names.
-KEPT = {"beside", "walk_packages", "walk_tb", "share_frequencies", "sensor_told", "told", "doubts"}
+# Names of others, former ones, and arguments of public functions that keep their names.
+KEPT = {"walk_packages", "walk_tb", "share_frequencies", "doubts"}
 
 
 def words_of(name):
@@ -70,6 +71,25 @@ def test_a_former_name_is_the_present_one_with_a_warning(room, former, present):
 def test_a_former_name_may_be_in_another_room(former):
     with pytest.warns(DeprecationWarning, match="is now snrmjax.diagnose.Confounder"):
         assert getattr(sj.model, former) is sj.diagnose.Confounder
+
+
+def test_former_attributes_and_arguments_are_the_present_ones_with_a_warning():
+    spring = sj.model.EFFECTS["cubic_stiffness"](1.0)
+    with pytest.warns(DeprecationWarning, match="AbstractForce.influence_vectors"):
+        assert spring.rows == spring.influence_vectors == (None,)
+    optional = OptionalModalData(points={"root": [0.5]})
+    with pytest.warns(DeprecationWarning, match="`beside` of linear_modes is now `optional`"):
+        modes = sj.model.linear_modes([1.0], [0.01], [[1.0]], [1.0], beside=optional)
+    assert modes.shape_at("root") == 0.5
+
+
+def test_former_attributes_of_own_classes_are_read_with_a_warning():
+    with pytest.warns(DeprecationWarning, match="Own.nonlinear_parameters"):
+
+        class Own(sj.identify.OwnFamily):
+            numbers = {"speed": (0.1,)}  # noqa: RUF012
+
+    assert Own.nonlinear_parameters == {"speed": (0.1,)}
 
 
 def test_refusals_have_a_class_of_their_own():

@@ -42,7 +42,7 @@ def of_one_sensor(data, model):
         *(model.modes.natural_frequency, model.modes.damping_ratio),
         *(np.asarray(model.modes.mode_shape)[[k]], model.modes.participation),
         sensors=(data.sensors[k],),
-        beside=OptionalModalData({name: model.modes.shape_at(name) for name in others}),
+        optional=OptionalModalData({name: model.modes.shape_at(name) for name in others}),
     )
     given = (data.level, data.frequency, data.force, seen.pop("velocity"))
     alone = sj.measure.steady_states(
@@ -63,7 +63,7 @@ def main() -> None:
             data, model = of_one_sensor(data, model)
         begin = time.perf_counter()
         found = sj.diagnose.locate_force(data, model, key["candidates"])
-        first = found.places[0]
+        first = found.candidates[0]
         lines.append(
             {
                 **{"set": path.stem, "kind": key["kind"], "sensors": len(data.sensors)},

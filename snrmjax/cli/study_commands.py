@@ -161,7 +161,7 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _print_study(study: "Study") -> None:
     names = ", ".join(study.names) or "only the noise"
-    at_sensor = f"; velocities at {study.sensor_told}" if study.sensor_told else ""
+    at_sensor = f"; velocities at {study.reported_sensor}" if study.reported_sensor else ""
     print_line(
         f"{study.name}: {study.n_members} members ({study.computation.kind}) in {study.n_chunks} "
         f"chunks; {names} {'vary' if len(study.names) > 1 else 'varies'}{at_sensor}"

@@ -11,5 +11,15 @@ AIAA J. 53 (2015) 3273, doi:10.2514/1.J053838.
 
 import lazy_loader
 
+from snrmjax.numerics.names import with_retired_names
+
 # The public names are in `__init__.pyi`; each module is imported with its first name.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__ = with_retired_names(
+    __name__,
+    __getattr__,
+    {
+        "StaticStatus": "snrmjax.condense.elements.statics.StaticStatus",
+        "static_solutions": "snrmjax.condense.elements.statics.static_solutions",
+    },
+)

@@ -1,7 +1,7 @@
 from .condensation import reduced_model
 from .elements.beam import Beam, PointMass, Support, rise_of_radius
 from .elements.beam_modes import beam_modes, participation, shape_at
-from .elements.statics import StaticStatus, static_cases, static_solutions
+from .elements.statics import static_cases
 from .load_cases import ReductionBasis, StaticCases
 from .load_set import displacement_for_ratio, modal_loads
 from .potential_fit import fit_potential
@@ -13,7 +13,6 @@ __all__ = [
     "PointMass",
     "ReductionBasis",
     "StaticCases",
-    "StaticStatus",
     "Support",
     "beam_modes",
     "displacement_for_ratio",
@@ -26,5 +25,4 @@ __all__ = [
     "shape_at",
     "static_cases",
     "static_displacement",
-    "static_solutions",
 ]

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.beam_description import THICKNESS, BeamDescription
 from snrmjax.condense.beam_parameters import (
+    THICKNESS,
+    BeamDescription,
     beam_parameters,
     check_beam_name,
     require_beam,

@@ -6,14 +6,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.beam_description import (
+from snrmjax.condense.beam_parameters import (
     LENGTH,
     SIDES,
     STIFFNESSES,
     THICKNESS,
     BeamDescription,
+    rise_of,
 )
-from snrmjax.condense.beam_parameters import rise_of
 from snrmjax.condense.elements.beam import Beam, PointMass, Support
 from snrmjax.condense.elements.beam_modes import beam_modes, participation, shape_at
 from snrmjax.condense.elements.statics import static_cases

@@ -17,6 +17,7 @@ from snrmjax.identify.test_model.priors import ONE_PHASE
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.names import with_former_attributes
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 from snrmjax.simulate.continuation.continuation import CurveStatus
@@ -39,10 +40,11 @@ class PhaseResonance(NamedTuple):
 _NOWHERE = PhaseResonance(np.nan, np.nan)
 
 
+@with_former_attributes({"held_out": "withheld"})
 class LevelResponse(NamedTuple):
     """A level's measured and predicted resonances.
 
-    `after` is that of the completed model or, for a withheld level (`held_out`), of the model that
+    `after` is that of the completed model or, for a withheld level (`withheld`), of the model that
     was completed without it; `completed` is that of the completed model in either case.
     """
 
@@ -51,7 +53,7 @@ class LevelResponse(NamedTuple):
     measured: PhaseResonance
     before: PhaseResonance
     after: PhaseResonance
-    held_out: bool  # withheld: the model of `after` was not fitted to the level
+    withheld: bool  # withheld: the model of `after` was not fitted to the level
     complete: bool = True  # whether both responses were traced to the end of the range
     completed: PhaseResonance = _NOWHERE  # of the model fitted to all levels
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from snrmjax.doctor.column_misreadings import is_other_scale, scale_findings, shaker_damping
 from snrmjax.doctor.corrections import TestCorrection, corrections, sweeps_apart
 from snrmjax.doctor.findings import Checkup, Finding, gravest_first
 from snrmjax.doctor.fitted_hypothesis import (
@@ -25,7 +26,6 @@ from snrmjax.doctor.priors import (
     OTHER_RANGE,
 )
 from snrmjax.doctor.record_checks import record_findings
-from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.structures import Structure

@@ -16,11 +16,10 @@ from .modal.modes_of_tests import find_modes, relative_to_base
 from .modal.response_data import joined_responses
 from .pointwise.backbone import Backbone
 from .pointwise.backbone_points import identify_points
-from .pointwise.inversion import closed_form, invert_amplitude_phase, invert_phasor
-from .pointwise.inversion_result import PointStatus
+from .pointwise.inversion import PointStatus, closed_form, invert_amplitude_phase, invert_phasor
 from .pointwise.prediction import predict_response, resonances
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
-from .prediction.new_level import ON_THE_CURVES, DayToDay, new_level
+from .prediction.new_level import WITHOUT_LEVEL_ERRORS, DayToDay, new_level
 from .scaling.scale import (
     AddedMassTest,
     Calibration,
@@ -33,7 +32,7 @@ from .scaling.scale import (
 
 __all__ = [
     "FAMILIES",
-    "ON_THE_CURVES",
+    "WITHOUT_LEVEL_ERRORS",
     "AddedMassTest",
     "Backbone",
     "Calibration",

@@ -71,7 +71,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
             {
                 "level": row.level,
                 "force_n": row.force,
-                "held_out": row.held_out,
+                "held_out": row.withheld,
                 **{
                     f"{name}_{quantity}": value if math.isfinite(value) else None
                     for name in ("measured", "before", "after")
@@ -176,13 +176,15 @@ def _part(part: Located) -> dict:
 
 def summarise_localisation(localisation: Localisation) -> dict:
     """Where a force acts: locations with their probabilities, and the law at the most probable."""
-    law = localisation.places[0].law
+    law = localisation.candidates[0].law
     return {
-        "where": localisation.by_place,
+        "where": localisation.probabilities,
         "where_misfit": localisation.misfit,
         "where_fits": localisation.fits,
         "where_law": None if law is None else {"kind": law.kind, "parameters": law.parameters},
-        "where_settled_by_sensor": None if localisation.told else localisation.settled_by,
+        "where_settled_by_sensor": None
+        if localisation.is_determined
+        else localisation.separating_sensor,
     }
 
 
@@ -191,7 +193,7 @@ def placed_answer(localisation: Localisation) -> dict:
 
     Parameters are physical (N, m, kg), like those of an effect with `at`.
     """
-    most_probable = localisation.places[0]
+    most_probable = localisation.candidates[0]
     law = most_probable.law
     if law is None:
         return {}

@@ -95,16 +95,14 @@ def read_former_answer(path: FilePath) -> FormerAnswer:
 
     Raises `ValueError` for a file not written by `snrmjax diagnose`.
     """
-    file = file_name(path)
+    file, text = file_name(path), read_text(path)
     try:
-        answer = json.loads(read_text(path))
+        answer = json.loads(text)
         probabilities = {
             tuple(name.split("+")): float(p) for name, p in answer["probabilities"].items()
         }
         return FormerAnswer(str(answer["verdict"]), tuple(answer["effects"]), probabilities)
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
-        if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
-            raise
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(
             f"{file} must be a diagnosis.json that `snrmjax diagnose` wrote, but is none "
             f"({shown(str(error))})."

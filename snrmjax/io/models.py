@@ -117,7 +117,7 @@ def _read(text: str, file: str, path: Path) -> Structure:
         modes = _modes(top, file, effects)
         potential = _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes)
         for k, effect in enumerate(effects, 1):
-            vectors = effect.rows if isinstance(effect, AbstractForce) else ()
+            vectors = effect.influence_vectors if isinstance(effect, AbstractForce) else ()
             for point, _ in (pair for vector in vectors if vector is not None for pair in vector):
                 _check_point(modes, point, f"effect {k} of {file}")
     return structure(
@@ -135,7 +135,7 @@ def _read(text: str, file: str, path: Path) -> Structure:
 def _check_point(modes: LinearModes, point: str, location: str) -> None:
     try:
         modes.shape_at(point)
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{location} cannot be read: {error}") from error
 
 
@@ -231,7 +231,7 @@ def _modes(top: TomlTable, file: str, effects: Sequence[AbstractEffect]) -> Line
             stds("damping_ratio_std"),
             stds("modal_mass_std", UNSTATED_MODAL_MASS_STD) if known_mass else None,
         ),
-        beside=OptionalModalData(
+        optional=OptionalModalData(
             {name: row[:n_modes].tolist() for name, row in others.items()},
             coupling,
             lag if any(lag := stds("participation_lag")) else None,
@@ -276,7 +276,7 @@ def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
     for name, value in table.entries.items():
         try:
             monomial = parse_monomial(name, n_modes)
-        except ValueError as error:
+        except InputError as error:
             raise InputError(f"{table.location} cannot be read: {error}") from error
         if monomial in coefficients:
             twice = f"{table.location} has the monomial {name!r} twice"
@@ -320,7 +320,7 @@ def _effect(table: TomlTable) -> AbstractEffect:
             at=influence_vector_of(table),
             normal_at=influence_vector_of(table, "normal_"),
         )
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{table.location} cannot be read: {error}") from error
 
 

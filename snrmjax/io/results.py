@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.identify.pointwise.inversion import PointStatus
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.numerics.rules import InputError

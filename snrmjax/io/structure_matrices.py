@@ -13,7 +13,7 @@ import scipy.sparse
 from jaxtyping import Float
 
 from snrmjax.io.files import shown
-from snrmjax.io.laboratory.arrays.matlab_elements import checked_variables
+from snrmjax.io.laboratory.arrays.matlab_files import checked_variables
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 from snrmjax.io.toml_table import TomlTable
 from snrmjax.model.attachment import InfluenceVector, between, influence_vector
@@ -63,7 +63,7 @@ def structure_of_matrices(
         raise table.refusal("points", "a list of names, one for each unknown", points)
     try:
         check_names(points, matrices["mass"].shape[0])
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{table.location} cannot be read: {error}") from error
     damping: Any = matrices.get("damping")
     if "damping_ratio" in parts:
@@ -84,7 +84,7 @@ def structure_of_matrices(
     _check_named(points, sensors or (), f"`points` in [sensors] of {file}")
     _check_named(points, dict(base.along if base else ()), f"`along` in [base] of {file}")
     for k, effect in enumerate(effects, 1):
-        vectors = effect.rows if isinstance(effect, AbstractForce) else ()
+        vectors = effect.influence_vectors if isinstance(effect, AbstractForce) else ()
         named = [point for vector in vectors if vector is not None for point, _ in vector]
         _check_named(points, named, f"effect {k} of {file}")
     try:
@@ -103,7 +103,7 @@ def structure_of_matrices(
             sensors=sensors,
             name=top.text("name", folder.stem),
         )
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{table.location} cannot be read: {error}") from error
     of_interest = top.whole("mode_of_interest", 1, 1)
     if of_interest > built.n_modes:
@@ -160,7 +160,9 @@ def element_participation(
 ) -> np.ndarray:
     """Participation wᵀφ of rigid-body modes in each nonlinear element, (element, mode)."""
     forces = [effect for effect in effects if isinstance(effect, AbstractForce)]
-    vectors = [dict(vector) for force in forces for vector in force.rows if vector is not None]
+    vectors = [
+        dict(vector) for force in forces for vector in force.influence_vectors if vector is not None
+    ]
     weights = np.array([[vector.get(name, 0.0) for name in names] for vector in vectors])
     return weights.reshape(-1, len(names)) @ rigid
 

@@ -1,13 +1,18 @@
 from .base_excitation import base_excited_states
 from .decays.isolated_decay import IsolatedDecay, isolate_decay
-from .indicators import appropriation_of, nnm_appropriation
 from .recordings.channels import Channel
 from .recordings.frequency_responses import FrequencyResponses, frequency_responses
 from .recordings.multisine import MultisineResponses, multisine_responses
 from .recordings.ring_down import find_ring_downs
 from .recordings.stepped_sine import SteppedSineStates, stepped_sine_states
 from .recordings.time_recording import TimeRecording, time_recording
-from .signals import force_velocity_loop, peak_amplitude, synthesise
+from .signals import (
+    appropriation_of,
+    force_velocity_loop,
+    nnm_appropriation,
+    peak_amplitude,
+    synthesise,
+)
 from .states import SteadyStates, join_steady_states, steady_states
 from .sweeps.slow_sweep import SweptStates, sweep_states
 from .sweeps.sweep_bias import sweep_bias

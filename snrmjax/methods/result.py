@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import with_former_attributes
 from snrmjax.numerics.result import AbstractResult, quantity, setting
 from snrmjax.numerics.status import Status
 
@@ -25,7 +26,7 @@ class MethodStatus(Status):
     ONE_SIDE = 2, "no states of equal amplitude on both sides of resonance"
     TOO_FEW_STATES = 3, "too few states of this amplitude"
     NOT_A_MODE = 4, "the identified stiffness or damping is not positive"
-    AMPLITUDE_HELD = (
+    AMPLITUDE_CONTROLLED = (
         5,
         "the displacement was controlled, so that states of equal amplitude are not a pair",
     )
@@ -47,6 +48,7 @@ class MethodPoint(NamedTuple):
     damping_ratio_std: float = np.nan
 
 
+@with_former_attributes({"found": "has_result"})
 class MethodResult(AbstractResult):
     """Natural frequency and damping against amplitude by one method.
 
@@ -95,7 +97,7 @@ class MethodResult(AbstractResult):
         ]
 
     @property
-    def found(self) -> Bool[np.ndarray, " point"]:
+    def has_result(self) -> Bool[np.ndarray, " point"]:
         """Points with a result."""
         return np.asarray(self.status) == int(MethodStatus.FOUND)
 

@@ -1,5 +1,4 @@
 from .attachment import between
-from .averaging import averaged_effect
 from .builders.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from .builders.matrices import Matrices, beam, chain, from_matrices
 from .effect_base import (
@@ -20,7 +19,7 @@ from .effect_metadata import (
     Symmetry,
     parameter,
 )
-from .effect_shape import shape_of
+from .effect_shape import averaged_effect, shape_of
 from .effects import EFFECTS, ELEMENTS, LAWS, make_effect, register_effect
 from .modes import (
     LinearModes,

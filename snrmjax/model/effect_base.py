@@ -23,6 +23,7 @@ from snrmjax.model.effect_metadata import Parameter, Part, Shape
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.nonsmooth_points import NonsmoothPoints, with_nonsmooth_points
 from snrmjax.model.potential import PolynomialPotential
+from snrmjax.numerics.names import take_former, with_former_attributes
 from snrmjax.numerics.rules import InputError
 
 Scalar = Float[Array, ""]
@@ -66,6 +67,7 @@ class AbstractEffect(eqx.Module):
         }
 
 
+@with_former_attributes({"rows": "influence_vectors"})
 class AbstractForce(AbstractEffect):
     """A force on the mode of interest or at points, defined over one cycle of a steady motion.
 
@@ -80,7 +82,7 @@ class AbstractForce(AbstractEffect):
     )
 
     @property
-    def rows(self) -> tuple[InfluenceVector | None, ...]:
+    def influence_vectors(self) -> tuple[InfluenceVector | None, ...]:
         """Its influence vectors: one, or two for contacts with tangential and normal motion.
 
         With several, displacements, velocities and forces have a last axis for them.
@@ -147,11 +149,15 @@ class AbstractHysteresis(AbstractForce):
 
     `cycle_force` is that of the steady cycle, which needs no states. For time integration take
     the effect that `scaled_for` returns, start from its `initial_states`, integrate `state_rate`
-    and apply `state_force`. With `held_in_steps` the states are constant within a step of the
+    and apply `state_force`. With `constant_in_steps` the states are constant within a step of the
     integrator and are updated by `after_step`.
     """
 
-    held_in_steps: ClassVar[bool] = False
+    constant_in_steps: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        take_former(cls, {"held_in_steps": "constant_in_steps"})
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
         """The same effect, prepared for time integration of motions up to these amplitudes.
@@ -174,7 +180,7 @@ class AbstractHysteresis(AbstractForce):
 
     @abstractmethod
     def state_rate(self, displacement: StateAt, velocity: StateAt, states: States) -> States:
-        """Rates of the internal states, per second; not used with `held_in_steps`."""
+        """Rates of the internal states, per second; not used with `constant_in_steps`."""
 
     def after_step(
         self,
@@ -186,13 +192,14 @@ class AbstractHysteresis(AbstractForce):
         """The internal states after a step of the integrator, corrected from its own result.
 
         Arguments: displacement and velocity at the `begin` and at the `end` of a step of `time` s.
-        Effects with `held_in_steps`, whose states switch between stick and slip, update them here.
+        Effects with `constant_in_steps`, whose states switch between stick and slip, update them
+        here.
         """
         return states
 
     def stuck_stiffness(self) -> Float[Array, " attachment"]:
         """The largest stiffness at every attachment, in 1/s², which limits the time step."""
-        return jnp.zeros(len(self.rows))
+        return jnp.zeros(len(self.influence_vectors))
 
     @abstractmethod
     def settled_states(

@@ -152,7 +152,7 @@ def elements_of(forces: Sequence[AbstractForce], modes: LinearModes) -> Elements
 
     Raises `ValueError` for a point at which the modes have no shape.
     """
-    attachments = list(dict.fromkeys(b for force in forces for b in force.rows))
+    attachments = list(dict.fromkeys(b for force in forces for b in force.influence_vectors))
     own = modes.mode_of_interest if all(attachment is None for attachment in attachments) else None
     of_interest = np.eye(modes.n_modes)[modes.mode_of_interest]
     if own is not None:
@@ -178,7 +178,9 @@ def _groups(forces: Sequence[AbstractForce], attachments: list) -> tuple[ForceGr
         somewhere = dataclasses.replace(force, **dict.fromkeys(where, _SOMEWHERE))
         leaves, kind = jax.tree.flatten(somewhere)
         key = (kind, tuple(np.shape(leaf) for leaf in leaves))
-        alike.setdefault(key, []).append((somewhere, [attachments.index(b) for b in force.rows]))
+        alike.setdefault(key, []).append(
+            (somewhere, [attachments.index(b) for b in force.influence_vectors])
+        )
     groups = []
     for members in alike.values():
         each = [force for force, _ in members]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
 
 from snrmjax.model.moving_base import BaseMotion, drive_unit
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.names import suggestion
+from snrmjax.numerics.names import suggestion, with_former_arguments
 from snrmjax.numerics.result import AbstractShown
 from snrmjax.numerics.rules import BELOW_ONE, NOT_NEGATIVE, POSITIVE, InputError, require
 from snrmjax.numerics.units import HERTZ
@@ -205,6 +205,7 @@ class LinearModesStd(NamedTuple):
     modal_mass: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None
 
 
+@with_former_arguments({"beside": "optional"})
 def linear_modes(
     natural_frequency: Shaped[np.ndarray | Array, " mode"] | list[float],
     damping_ratio: Shaped[np.ndarray | Array, " mode"] | list[float],
@@ -215,14 +216,14 @@ def linear_modes(
     mode_of_interest: int = 0,
     rigid_body: RigidBodyModes | None = None,
     std: LinearModesStd | None = None,
-    beside: OptionalModalData | None = None,
+    optional: OptionalModalData | None = None,
 ) -> LinearModes:
     """Build `LinearModes` from arrays or lists, checking shapes and ranges.
 
     Arguments: natural frequencies in rad/s, damping as a fraction of critical, shapes at the
     sensors and participations Φᵀb in kg^-1/2; `rigid_body` modes likewise; `std` has the 1σ of
     frequencies and damping ratios (exact without) and of modal masses (relative,
-    `UNSTATED_MODAL_MASS_STD` without); `beside` has optional data: shapes at points without a
+    `UNSTATED_MODAL_MASS_STD` without); `optional` has optional data: shapes at points without a
     sensor, damping that couples the modes, the lagging part of a force, and a base or an
     unbalance in place of the force.
     Raises `ValueError` that names the argument whose shape or value is wrong. Traced numbers
@@ -277,23 +278,23 @@ def linear_modes(
             numbers[f"{name}_std"] = _vector(f"std.{name}", values, n_modes)
         elif name != "modal_mass":
             numbers[f"{name}_std"] = np.zeros(n_modes)
-    optional = beside or OptionalModalData()
+    optional = optional or OptionalModalData()
     points = optional.points or {}
     for name in points:
         if name in names:
-            raise InputError(f"`beside.points` has {name!r}, which is a sensor.")
+            raise InputError(f"`optional.points` has {name!r}, which is a sensor.")
     if points:
-        shapes_there = [_vector(f"beside.points[{k!r}]", s, n_modes) for k, s in points.items()]
+        shapes_there = [_vector(f"optional.points[{k!r}]", s, n_modes) for k, s in points.items()]
         numbers["point_shape"] = _numbers(shapes_there)
     if optional.damping_coupling is not None:
         numbers["damping_coupling"] = _coupling(optional.damping_coupling, n_modes)
     if optional.participation_lag is not None:
-        lag = _vector("beside.participation_lag", optional.participation_lag, n_modes)
+        lag = _vector("optional.participation_lag", optional.participation_lag, n_modes)
         numbers["participation_lag"] = lag
     if optional.base is not None:
         _check_base(optional.base, (*names, *points), participations)
     if optional.unbalance is not None:
-        require("`beside.unbalance`", optional.unbalance, POSITIVE)
+        require("`optional.unbalance`", optional.unbalance, POSITIVE)
         numbers["unbalance"] = _numbers(optional.unbalance)
     if optional.base is not None and optional.unbalance is not None:
         raise InputError("a base and an unbalance cannot both drive a structure.")
@@ -326,10 +327,10 @@ def _numbers(value: Any) -> Any:
 def _coupling(damping: Any, n_modes: int) -> Any:
     """The checked damping coupling matrix."""
     matrix = _numbers(damping)
-    require("`beside.damping_coupling`", matrix)
+    require("`optional.damping_coupling`", matrix)
     if matrix.shape != (n_modes, n_modes):
         raise InputError(
-            f"`beside.damping_coupling` must have shape ({n_modes}, {n_modes}), but has "
+            f"`optional.damping_coupling` must have shape ({n_modes}, {n_modes}), but has "
             f"{matrix.shape}."
         )
     return matrix

@@ -92,7 +92,7 @@ class Structure(AbstractShown):
         lines = [f"Structure {self.name!r}", of_modes, *(f"  {mode}" for mode in modes)]
         lines.append(f"polynomial potential: {terms}")
         for effect in self.effects:
-            influence = effect.rows if isinstance(effect, AbstractForce) else (None,)
+            influence = effect.influence_vectors if isinstance(effect, AbstractForce) else (None,)
             values = [
                 f"{name} {_text(getattr(effect, name))} {unit}".rstrip()
                 for name, of in effect.parameters().items()

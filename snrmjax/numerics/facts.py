@@ -1,9 +1,44 @@
-"""Facts: typed statements about a result, a kind with values, from which sentences are made."""
+"""Facts: typed statements about a result, from which sentences are made, and what shows them.
+
+A fact is a kind with values. `snrmjax.report` registers itself as what shows facts and results:
+packages below it never import it.
+"""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Protocol
 
-from snrmjax.numerics.rendering import renderer
+from snrmjax.numerics.rules import InputError
+
+
+class Renderer(Protocol):
+    """Shows facts and results."""
+
+    def sentence(self, fact: Any) -> str:
+        """A `Fact` as a sentence."""
+
+    def screen(self, result: Any) -> str:
+        """A result as text for one screen."""
+
+    def html(self, result: Any) -> str:
+        """A result as HTML for notebooks."""
+
+    def figure(self, result: Any, **settings: Any) -> Any:
+        """The figure of a result."""
+
+
+_registered: list[Renderer] = []
+
+
+def show_by(renderer: Renderer) -> None:
+    """Show facts and results by this renderer from here on."""
+    _registered[:] = [renderer]
+
+
+def renderer() -> Renderer:
+    """The registered renderer."""
+    if not _registered:
+        raise InputError("nothing shows facts and results: `import snrmjax` registers what does.")
+    return _registered[0]
 
 
 class Fact(Mapping[str, Any]):

@@ -1,10 +1,14 @@
 """Names: suggestions for misspelt ones in error messages, and aliases of former public ones."""
 
 import difflib
+import functools
 import importlib
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar, cast
+
+C = TypeVar("C", bound=type)
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def near_miss(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
@@ -43,14 +47,57 @@ def with_retired_names(
         if name not in names:
             return current(name)
         elsewhere, _, present = names[name].rpartition(".")
-        warnings.warn(
-            f"{package}.{name} is now {elsewhere or package}.{present}: the former name goes in "
-            "the next release.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
+        _warn(f"{package}.{name}", f"{elsewhere or package}.{present}")
         if elsewhere:
             return getattr(importlib.import_module(elsewhere), present)
         return current(present)
 
     return attribute
+
+
+def with_former_attributes(names: Mapping[str, str]) -> Callable[[C], C]:
+    """A decorator of classes, with `names` from former to present attributes."""
+
+    def decorate(cls: C) -> C:
+        for former, present in names.items():
+
+            def value(self: Any, former: str = former, present: str = present) -> Any:
+                _warn(f"{cls.__name__}.{former}", f"{cls.__name__}.{present}")
+                return getattr(self, present)
+
+            setattr(cls, former, property(value))
+        return cls
+
+    return decorate
+
+
+def with_former_arguments(names: Mapping[str, str]) -> Callable[[F], F]:
+    """A decorator of functions, with `names` from former to present keyword arguments."""
+
+    def decorate(function: F) -> F:
+        @functools.wraps(function)
+        def called(*arguments: Any, **settings: Any) -> Any:
+            for former in names.keys() & settings.keys():
+                _warn(f"`{former}` of {function.__name__}", f"`{names[former]}`")
+                settings[names[former]] = settings.pop(former)
+            return function(*arguments, **settings)
+
+        return cast(F, called)
+
+    return decorate
+
+
+def take_former(cls: type, names: Mapping[str, str]) -> None:
+    """Class attributes of a user's class under their present names, from `names` of former ones."""
+    for former in names.keys() & vars(cls).keys():
+        _warn(f"{cls.__name__}.{former}", f"{cls.__name__}.{names[former]}")
+        setattr(cls, names[former], vars(cls)[former])
+
+
+def _warn(former: str, present: str) -> None:
+    """Warn the caller of the caller that a name is a former one."""
+    warnings.warn(
+        f"{former} is now {present}: the former name goes in the next release.",
+        DeprecationWarning,
+        stacklevel=3,
+    )

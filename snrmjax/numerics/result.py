@@ -8,8 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.rendering import renderer
+from snrmjax.numerics.facts import Fact, renderer
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.status import Status
 from snrmjax.numerics.units import DEGREE, HERTZ

@@ -28,6 +28,7 @@ from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure, driven_in_newtons
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import with_former_attributes
 
 # Deviations of a completed model's resonance from the measured one, far above repeatability.
 _FAR_OFF = 0.01  # relative, of frequencies
@@ -35,16 +36,18 @@ _FAR_APART = 0.2  # of the logarithm of velocities
 _log = logging.getLogger(__name__)
 
 
+@with_former_attributes({"held": "required_forces"})
 class SimulatedLevels(NamedTuple):
     """Responses of all levels, of the given and of the completed model.
 
-    For a response-controlled test `held` are the required forces of both models.
+    For a response-controlled test `required_forces` are the required forces of both models.
     """
 
     predicted: LevelPredictions
-    held: tuple[list[ControlledVelocityCurve], list[ControlledVelocityCurve]] | None
+    required_forces: tuple[list[ControlledVelocityCurve], list[ControlledVelocityCurve]] | None
 
 
+@with_former_attributes({"is_placed": "is_located"})
 class DiagnosedTest(NamedTuple):
     """A diagnosis, and its simulated responses."""
 
@@ -54,14 +57,14 @@ class DiagnosedTest(NamedTuple):
     where: Localisation | None = None  # None: nothing missing, or a single point
 
     @property
-    def is_placed(self) -> bool:
+    def is_located(self) -> bool:
         """Whether the answer is a law at one point that explains all sensors within the noise.
 
         A single effect named for the whole mode remains an effect on the mode.
         """
         if self.where is None or not self.where.explains:
             return False
-        law, diagnosis = self.where.places[0].law, self.diagnosis
+        law, diagnosis = self.where.candidates[0].law, self.diagnosis
         of_mode = diagnosis.effects if diagnosis.verdict is Verdict.NAMED else ()
         return law is not None and of_mode != (law.kind,)
 
@@ -72,7 +75,7 @@ class DiagnosedTest(NamedTuple):
         `diagnosis.verdict` is that on effects on the mode, by the reference sensor; a law at one
         point that explains all sensors replaces it.
         """
-        if self.where is not None and self.is_placed:
+        if self.where is not None and self.is_located:
             return Verdict(placed_answer(self.where)["verdict"])
         return self.diagnosis.verdict
 
@@ -102,7 +105,7 @@ def diagnose_test(
     diagnosis = diagnose_model(model, data, former=former)
     _log.info("looks for the point where the missing force acts")
     location = _localisation(diagnosis, data, model, where)
-    if location is not None and DiagnosedTest(diagnosis, model, where=location).is_placed:
+    if location is not None and DiagnosedTest(diagnosis, model, where=location).is_located:
         diagnosis = _completed_at(diagnosis, location)
     if not (simulate and diagnosis.effects and diagnosis.completed is not None):
         return DiagnosedTest(diagnosis, model, where=location)

@@ -6,7 +6,7 @@ them are imported at first use.
 
 from typing import Any
 
-from snrmjax.numerics.rendering import show_by
+from snrmjax.numerics.facts import show_by
 
 
 class _Report:

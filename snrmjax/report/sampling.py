@@ -69,16 +69,13 @@ def sample_backbone(backbone: "Backbone", *, reach: float = 1.0) -> BackboneSamp
     return _in_units(values, np.linspace(*ends, _CURVE_POINTS) > float(backbone.largest))
 
 
-def sample_fit(
-    fit: "JointFit", *, of_a_new_level: bool = False, reach: float = 1.0
-) -> BackboneSamples:
-    """The curves of a joint fit from zero to `reach` times the largest measured velocity."""
-    largest = fit.largest[1]
-    velocity = np.linspace(0.0, reach * largest, _CURVE_POINTS)
+def sample_fit(fit: "JointFit", *, include_level_variance: bool = False) -> BackboneSamples:
+    """The curves of a joint fit from zero to the largest measured velocity."""
+    velocity = np.linspace(0.0, fit.largest[1], _CURVE_POINTS)
     from snrmjax.identify.inference.fitted_curves import fitted_values
 
-    values = fitted_values(fit, velocity, of_a_new_level=of_a_new_level)
-    return _in_units(values, velocity > largest)
+    values = fitted_values(fit, velocity, include_level_variance=include_level_variance)
+    return _in_units(values, np.zeros(_CURVE_POINTS, dtype=bool))
 
 
 def _in_units(values: "BackboneValues", beyond: np.ndarray) -> BackboneSamples:

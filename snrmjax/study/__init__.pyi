@@ -14,8 +14,6 @@ from .variations import (
     MultivariateNormal,
     Normal,
     Uniform,
-    posterior_variation,
-    stated_variations,
 )
 
 __all__ = [
@@ -36,11 +34,9 @@ __all__ = [
     "VirtualTests",
     "function_quantities",
     "open_study",
-    "posterior_variation",
     "propagate_uncertainty",
     "read_study",
     "response_quantities",
     "run_study",
     "sobol_indices",
-    "stated_variations",
 ]

@@ -21,10 +21,11 @@ from snrmjax.study.execution import (
     local_processes,
     receipts,
 )
-from snrmjax.study.identity import description, differences
 from snrmjax.study.store import (
     StudyFolder,
     collect_chunks,
+    description,
+    differences,
     is_collected,
     read_study_plan,
     stored_description,

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.condense.beam_description import RADIUS, RISE
 from snrmjax.condense.beam_models import BeamModels
-from snrmjax.condense.beam_parameters import beam_rules, check_beam_name
+from snrmjax.condense.beam_parameters import RADIUS, RISE, beam_rules, check_beam_name
 from snrmjax.model.parameters import (
     parameter_names,
     parameter_rules,
@@ -24,6 +23,7 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.names import with_former_attributes
 from snrmjax.numerics.rules import POSITIVE, InputError, Rule
 from snrmjax.numerics.units import HERTZ
 from snrmjax.study.computations.base import (
@@ -41,6 +41,7 @@ _IN_HERTZ = ".frequency_hz"  # alternative to `natural_frequency` in rad/s, as i
 _STRANGE = 3.0  # ratio to the model's frequency above which a unit error is assumed
 
 
+@with_former_attributes({"sensor_told": "reported_sensor"})
 class Study(eqx.Module):
     """Many members of one model and the computation for each.
 
@@ -75,7 +76,7 @@ class Study(eqx.Module):
         return number_of_members(self.variations, self.sampling)
 
     @property
-    def sensor_told(self) -> str | None:
+    def reported_sensor(self) -> str | None:
         """The sensor of peaks and velocities; None where no output refers to one.
 
         Raises `ValueError` for a `sensor` that the model does not have.
@@ -223,7 +224,7 @@ def _check_names(study: Study) -> None:
 
 
 def _check_sensor(study: Study) -> None:
-    requested, used = study.sensor, study.sensor_told
+    requested, used = study.sensor, study.reported_sensor
     if requested not in (None, used):
         kind = study.computation.kind
         instead = f"uses {used}, where the mode of interest moves most"

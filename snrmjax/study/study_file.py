@@ -179,9 +179,10 @@ def _computation(
         raise InputError(
             f"`from_hz` must be below `to_hz`, but {top.location} has {ends[0]:g} and {ends[1]:g}."
         )
-    within = ResponseRange(
-        ends[0] * HERTZ, ends[1] * HERTZ, harmonics, _flag(top, "stability", True)
-    )
+    stability = top.entries.get("stability", True)
+    if not isinstance(stability, bool):
+        raise top.refusal("stability", "true or false", stability)
+    within = ResponseRange(ends[0] * HERTZ, ends[1] * HERTZ, harmonics, stability)
     forces = _forces(top)
     varied = any(FORCE in variation.names for variation in variations)
     if forces is None and not varied and model.modes.unbalance is not None:
@@ -217,10 +218,3 @@ def _errors(top: TomlTable) -> MeasurementErrors:
         stds["level_gain"],
         stds["level_phase_deg"] * DEGREE,
     )
-
-
-def _flag(top: TomlTable, key: str, default: bool) -> bool:
-    value = top.entries.get(key, default)
-    if not isinstance(value, bool):
-        raise top.refusal(key, "true or false", value)
-    return value

@@ -11,10 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from snrmjax.identify.calibrate.backbone_calibration import BackboneCalibration
-from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
-from snrmjax.model.parameters import parameter_values, stated_stds
-from snrmjax.model.structures import Structure
 from snrmjax.numerics.rules import POSITIVE, InputError
 
 _FEWEST, _MOST = 2, 10_000_000  # values of a range
@@ -206,29 +202,6 @@ class MultivariateNormal(AbstractVariation):
         values, vectors = xp.linalg.eigh(self.covariance / xp.outer(scale, scale))
         root = scale[:, None] * vectors * xp.sqrt(xp.maximum(values, 0.0))
         return self.mean + z @ root.T
-
-
-def stated_variations(model: Structure) -> tuple[Normal, ...]:
-    """The parameters of a model with a stated standard deviation, as normal distributions.
-
-    Raises `ValueError` where none does.
-    """
-    values, stds = parameter_values(model), stated_stds(model)
-    if not stds:
-        raise InputError("the model states no standard deviation of its parameters.")
-    return tuple(Normal((name,), values[name], std) for name, std in stds.items())
-
-
-def posterior_variation(calibrated: CalibratedModel | BackboneCalibration) -> MultivariateNormal:
-    """The fitted parameters of a calibration with their covariance, as a joint normal distribution.
-
-    Raises `ValueError` for a calibration that did not converge.
-    """
-    if not calibrated.converged:
-        raise InputError(
-            f"the calibration did not converge ({calibrated.status}): its covariance is not valid."
-        )
-    return MultivariateNormal(calibrated.names, calibrated.values, calibrated.covariance)
 
 
 def _scale(covariance: Any, xp: ModuleType = np) -> Any:

@@ -84,7 +84,7 @@ def test_one_program_simulates_before_after_and_withheld_levels():
     found = predicted_levels(model, doubled, data, 0, {1: tripled})
     assert len(found.before) == len(found.after) == 2
     rows = found.levels
-    assert [row.held_out for row in rows] == [False, True]
+    assert [row.withheld for row in rows] == [False, True]
     for row, factor in zip(rows, (2.0, 3.0), strict=True):
         tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
         assert row.before.velocity == pytest.approx(tip, rel=1e-9)

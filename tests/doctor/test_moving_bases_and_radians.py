@@ -27,7 +27,7 @@ def on_a_base(recorded, declared, seed=0):
         [[SHAPE]],
         [-SHAPE],
         sensors=("tip",),
-        beside=OptionalModalData(base=base_motion(declared)),
+        optional=OptionalModalData(base=base_motion(declared)),
     )
     return states_relative_to_base(data, modes.base), sj.model.structure(modes)
 

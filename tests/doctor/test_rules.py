@@ -6,9 +6,9 @@ from scipy.signal import lsim
 from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
+from snrmjax.doctor.column_misreadings import is_other_scale
 from snrmjax.doctor.findings import KINDS, SEVERITIES, Finding
 from snrmjax.doctor.fitted_hypothesis import Scale, checked_states, fit_hypothesis, with_mass
-from snrmjax.doctor.scale_findings import is_other_scale
 from snrmjax.measure import Channel, time_recording
 
 

@@ -14,7 +14,7 @@ import snrmjax as sj
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.identify.curves.splines import Spline
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.identify.pointwise.inversion import PointStatus
 
 FREQUENCY = np.array([490.0, 497.0, 500.0, 506.0, 512.0, 495.0])
 FORCE = np.array([1.0, 1.0, 2.0, 2.0, 1.5, 0.7])

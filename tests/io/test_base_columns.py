@@ -19,7 +19,7 @@ def model(motion):
     modes = sj.model.linear_modes(
         *([OWN], [RATIO], [[MASS**-0.5]], [-(MASS**0.5)]),
         sensors=("tip",),
-        beside=OptionalModalData(base=base),
+        optional=OptionalModalData(base=base),
     )
     return sj.model.structure(modes)
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import snrmjax  # noqa: F401
-from snrmjax.measure.indicators import appropriation_of, nnm_appropriation
+from snrmjax.measure.signals import appropriation_of, nnm_appropriation
 from snrmjax.measure.states import steady_states
 
 OMEGA = 500.0

@@ -42,7 +42,7 @@ def test_the_backbone_does_not_depend_on_the_gain(laboratory):
         for gain, targets in ((20.0, [0.3, 0.6]), (40.0, [0.25, 0.5]))
     ]
     for result in found:
-        assert result.found.all()
+        assert result.has_result.all()
         half = REST**2 / 2
         amplitude = result.velocity
         true = np.sqrt(half + np.sqrt(half**2 + 0.75 * CUBIC * amplitude**2))

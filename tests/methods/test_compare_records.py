@@ -10,8 +10,8 @@ import pytest
 import snrmjax as sj
 from snrmjax.cli import main
 from snrmjax.measure import Channel, time_recording
+from snrmjax.methods.records.recorded_decays import recorded_velocity
 from snrmjax.methods.records.recorded_test import RecordKind, recorded_test
-from snrmjax.methods.records.recorded_velocity import recorded_velocity
 from snrmjax.pipelines.measured_files import read_measured_test
 
 HERTZ = 2 * np.pi

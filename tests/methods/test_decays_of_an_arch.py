@@ -73,7 +73,9 @@ def mode():
 )
 def test_a_softening_mode_of_even_terms(decay, mode, method, frequency, damping):
     result = method(*decay, least_amplitude=0.05 * mode[0, -1])
-    good = result.found & (result.velocity < mode[0, -1]) & (result.velocity > 0.1 * mode[0, -1])
+    good = (
+        result.has_result & (result.velocity < mode[0, -1]) & (result.velocity > 0.1 * mode[0, -1])
+    )
     assert good.sum() > 2
     omega, ratio = (np.interp(result.velocity[good], mode[0], row) for row in mode[1:])
     np.testing.assert_allclose(result.natural_frequency[good], omega, rtol=frequency)

@@ -30,7 +30,7 @@ VOLTAGES = np.array([0.5, 1.5, 3.0, 5.0])
 
 def test_it_climbs_the_backbone_on_a_shaker_whose_force_drops(beam):
     result = sj.methods.phase_locked_loop(laboratory(beam), VOLTAGES)
-    assert result.found.all()
+    assert result.has_result.all()
     assert result.natural_frequency[-1] / REST > 1.05
     np.testing.assert_allclose(result.natural_frequency, backbone(result.velocity), rtol=2e-4)
     modal = 2 * result.damping_ratio * result.natural_frequency
@@ -54,7 +54,7 @@ def test_the_result_does_not_depend_on_the_gains_and_bad_ones_are_reported(beam)
 def test_noise_stays_within_its_error(beam):
     lab = laboratory(beam, force_noise=0.02, velocity_noise=2e-3)
     result = sj.methods.phase_locked_loop(lab, VOLTAGES[2:3].repeat(6))
-    assert result.found.all()
+    assert result.has_result.all()
     off = result.natural_frequency - backbone(result.velocity)
     score = (off - off.mean()) / result.natural_frequency_std
     assert 0.4 < np.sqrt(np.mean(score**2)) < 2.5

@@ -11,7 +11,7 @@ import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
 from snrmjax.methods.records.state_space import StateSpace, hold, modal_constant, monomials
 from snrmjax.methods.records.state_space import response as model_response
-from snrmjax.methods.records.state_space_fit import _order
+from snrmjax.methods.records.state_space_fit import _order, fit_state_space
 from snrmjax.methods.records.state_space_start import linear_terms, subspace_poles
 
 REST, RATIO, CUBIC, MASS = 2 * np.pi * 40.0, 0.01, 6e9, 0.5  # rad/s, 1, 1/(m² s²), kg
@@ -102,7 +102,7 @@ def backbone(velocity):
 def test_mode_of_a_duffing_oscillator_from_three_realisations(motion):
     records = [multisine(0.5, seed, motion=motion) for seed in (0, 1, 2)]
     result = sj.methods.pnlss(records, "force", "tip")
-    assert result.found.all()
+    assert result.has_result.all()
     # Four of the fit's 1σ, and for frequency the truncation error of one-term harmonic balance.
     off = np.asarray(result.natural_frequency) - backbone(np.asarray(result.velocity))
     assert np.all(np.abs(off) < 4 * np.asarray(result.natural_frequency_std) + 3e-5 * REST)
@@ -131,7 +131,7 @@ def test_what_cannot_be_fitted_is_refused():
         channels = [Channel("force", "force"), Channel("tip", "velocity")]
         return time_recording(np.stack([force_samples, values]), channels, rate)
 
-    fit = sj.methods.fit_state_space
+    fit = fit_state_space
     with pytest.raises(ValueError, match="`order` must be 2, 4 or 6"):
         fit(record(moved), "force", "tip", order=3)
     with pytest.raises(ValueError, match="`degrees` must lie between 2 and 7"):
@@ -155,7 +155,7 @@ def test_realisations_and_levels_of_one_test_are_one_model():
     (result,) = sj.methods.compare_methods(records, modes, ["pnlss"]).results
     assert [n["n"] for n in result.notes if n.kind == "one_model_of_records"] == [3]
     assert result.notes[0]["validation"] < 0.05
-    assert result.found.sum() == 25
+    assert result.has_result.sum() == 25
     off = np.asarray(result.natural_frequency) - backbone(np.asarray(result.velocity))
     assert np.all(np.abs(off) < 4 * np.asarray(result.natural_frequency_std) + 3e-5 * REST)
 

@@ -32,7 +32,7 @@ def free_motion(amplitude):
 @pytest.mark.parametrize("reading", READINGS)
 def test_duffing_decays_along_its_backbone(decay, reading):
     result = sj.methods.resonant_decay(*decay, reading=reading)
-    assert result.found.all()
+    assert result.has_result.all()
     omega, peak, fundamental = free_motion(np.linspace(1e-5, 2.1e-3, 4000))
     velocity = fundamental if reading == "hilbert" else peak
     true = np.interp(result.velocity, velocity, omega)

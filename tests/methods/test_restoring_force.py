@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 import snrmjax as sj
+from snrmjax.methods.records.restoring_force import fit_restoring_force
 
 REST, CUBIC = 2 * np.pi * 40.0, 6e9
 VISCOUS, QUADRATIC = 1.0, 2.0  # 1/s, 1/m
@@ -48,7 +49,7 @@ def test_forces_and_mode_of_a_duffing_oscillator(forced):
     start, load = ((0.0, 0.0), sweep) if forced else ((1.5e-3, 0.0), None)
     time, velocity, force = integrated(start, load)
     given = (force, modes) if forced else ()
-    fitted = sj.methods.fit_restoring_force(time, velocity, *given)
+    fitted = fit_restoring_force(time, velocity, *given)
     assert fitted.misfit < 5e-3
     np.testing.assert_allclose(fitted.elastic[0], REST**2, rtol=2e-3)
     np.testing.assert_allclose(fitted.elastic[2], CUBIC, rtol=0.05)
@@ -63,11 +64,11 @@ def test_forces_and_mode_of_a_duffing_oscillator(forced):
 def test_what_cannot_be_fitted_is_refused():
     time, velocity, force = integrated((1e-3, 0.0), seconds=0.5)
     with pytest.raises(ValueError, match="`degree` must be from 1 to 9"):
-        sj.methods.fit_restoring_force(time, velocity, degree=0)
+        fit_restoring_force(time, velocity, degree=0)
     with pytest.raises(ValueError, match="`modes` are needed with a force"):
-        sj.methods.fit_restoring_force(time, velocity, force)
+        fit_restoring_force(time, velocity, force)
     with pytest.raises(ValueError, match="samples a cycle"):
-        sj.methods.fit_restoring_force(time[::20], velocity[::20])
+        fit_restoring_force(time[::20], velocity[::20])
     modes = sj.model.linear_modes([REST], [0.002], [[1.0]], [1.0])
     with pytest.raises(ValueError, match="`force` must be finite"):
-        sj.methods.fit_restoring_force(time, velocity, force[1:], modes)
+        fit_restoring_force(time, velocity, force[1:], modes)

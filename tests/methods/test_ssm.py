@@ -45,7 +45,7 @@ def scores(result):
 
 def test_duffing_decays_along_its_backbone(decay):
     result = sj.methods.ssm(*decay, terms=5)
-    assert result.found.all()
+    assert result.has_result.all()
     assert np.ptp(result.natural_frequency) > 0.08 * REST
     _, relative = scores(result)
     # What a polynomial of degree 9 leaves of these curves, near the largest amplitude.
@@ -120,4 +120,4 @@ def test_bad_records_are_refused(decay):
 def test_growth_is_not_a_mode(decay):
     time, velocity = decay
     result = sj.methods.ssm(time, velocity[::-1].copy(), terms=3)
-    assert not result.found.any()
+    assert not result.has_result.any()

@@ -66,7 +66,7 @@ def constant_response(sizes=(1e-4, 3e-4, 6e-4, 1e-3), points=21):
 
 def errors(result):
     """Relative errors of frequency and damping against the exact curves."""
-    found = result.found
+    found = result.has_result
     velocity = np.asarray(result.velocity)[found]
     natural = np.asarray(result.natural_frequency)[found]
     x = velocity / natural
@@ -77,8 +77,8 @@ def errors(result):
 
 def test_concerto_finds_the_mode_of_two_states_of_equal_displacement():
     result = sj.methods.concerto(constant_force(), modes_of())
-    assert result.found.all()
-    assert len(result.found) == 30
+    assert result.has_result.all()
+    assert len(result.has_result) == 30
     assert max(errors(result)) < 1e-7
 
 
@@ -97,20 +97,20 @@ def test_concerto_needs_no_modal_constant():
 def test_response_control_is_a_linear_mode_at_each_level():
     for method in (sj.methods.rct, sj.methods.harmonic_force_surface):
         result = method(constant_response(), modes_of())
-        assert result.found.all()
+        assert result.has_result.all()
         assert list(result.level) == [1, 2, 3, 4]
         assert max(errors(result)) < 1e-6
 
 
 def test_controlled_displacements_are_not_pairs():
     result = sj.methods.concerto(constant_response(), modes_of())
-    assert list(result.status) == 4 * [int(MethodStatus.AMPLITUDE_HELD)]
+    assert list(result.status) == 4 * [int(MethodStatus.AMPLITUDE_CONTROLLED)]
 
 
 def test_levels_of_constant_force_are_cut_at_equal_displacement():
     data = constant_force(forces=(0.05, 0.07, 0.1, 0.14), fractions=np.linspace(0.3, 0.999, 60))
     result = sj.methods.rct(data, modes_of())
-    assert result.found.sum() > 5
+    assert result.has_result.sum() > 5
     assert [note.kind for note in result.notes] == ["sections_between_levels"]
     frequency, damping = errors(result)
     assert frequency < 1e-5
@@ -139,7 +139,7 @@ def test_phase_resonance_reads_frequency_and_damping_where_the_phase_is_zero():
     shape, participation = -0.5, 2.0  # modal mass 1 at the sensor, which looks the other way
     data = table(np.repeat([1, 2], len(steps)), frequency, -stiffness, x)
     result = sj.methods.phase_resonance(data, modes_of(shape, participation))
-    assert result.found.all()
+    assert result.has_result.all()
     frequency_error, damping_error = errors(result)
     assert frequency_error < 1e-6
     assert damping_error < 5e-3

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractMemoryless
+from snrmjax.model.effect_shape import averaged_effect
 from snrmjax.model.effects import make_effect
 
 AMPLITUDE = np.array([0.3, 0.5, 0.9, 4.0])

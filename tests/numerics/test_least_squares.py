@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from snrmjax.numerics.least_squares import inverse_of, root_of_inverse
+from snrmjax.numerics.levenberg_marquardt import inverse_of, root_of_inverse
 
 RNG = np.random.default_rng(0)
 UNITS = np.array([1e-6, 1.0, 1e5, 3.0])

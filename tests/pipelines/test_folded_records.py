@@ -6,7 +6,7 @@ import pytest
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import time_recording
-from snrmjax.pipelines.folded_records import folded_records
+from snrmjax.pipelines.whole_test import folded_records
 
 
 def test_every_state_has_its_record_with_the_harmonics_that_it_was_made_of():

@@ -255,7 +255,7 @@ def test_disagreement_is_located_in_words():
 def test_predictions_of_unseen_levels_are_told_from_those_of_the_completed_model(drag, pictures):
     levels, figures = pictures
     unseen = max(levels, key=lambda one: one.force)
-    assert unseen.held_out
+    assert unseen.withheld
     assert unseen.completed.velocity != unseen.after.velocity
     html = html_of(drag[2], (levels, figures)).replace("\u00a0", " ")
     own, out = f"{unseen.completed.frequency:.5g} Hz", f"{unseen.after.frequency:.5g} Hz"

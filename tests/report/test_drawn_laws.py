@@ -5,7 +5,7 @@ import pytest
 
 from snrmjax.diagnose.drawn_law import DrawnLaw, LawOnset
 from snrmjax.model.effect_metadata import Argument
-from snrmjax.report.figures.drawn_laws import drawn_laws_figure, law_tables
+from snrmjax.report.figures.parts import drawn_laws_figure, law_tables
 
 AT = np.array([0.0, 1e-3, 2e-3, 4e-3])
 SPRING = DrawnLaw(

@@ -9,7 +9,7 @@ import snrmjax as sj
 from snrmjax.cli import main
 from snrmjax.numerics.units import HERTZ
 from snrmjax.study.computations.base import MEMBER, AbstractComputation, Output
-from snrmjax.study.identity import description, differences
+from snrmjax.study.store import description, differences
 
 from .conftest import InThisProcess
 

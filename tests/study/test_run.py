@@ -367,6 +367,6 @@ def test_virtual_tests_use_the_sensor_that_moves_most(two_sensors):
     within = sj.study.ResponseRange(0.8 * OMEGA, 1.1 * OMEGA)
     tests = sj.study.VirtualTests(within, np.array([0.5]))
     varied = (sj.study.Discrete("mode_1.damping_ratio", [0.02]),)
-    assert sj.study.Study("test", two_sensors, tests, varied).sensor_told == "a"
+    assert sj.study.Study("test", two_sensors, tests, varied).reported_sensor == "a"
     with pytest.raises(ValueError, match="virtual_test uses a, where the mode of interest"):
         sj.study.Study("test", two_sensors, tests, varied, sensor="b").ensemble()

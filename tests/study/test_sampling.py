@@ -3,10 +3,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
-from snrmjax.model.builders.beams import curved_beam
-from snrmjax.model.parameters import with_stated_std
-from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.study.sampling import Sampling, drawn_members, member_seed, number_of_members
 from snrmjax.study.variations import (
     Discrete,
@@ -14,8 +10,6 @@ from snrmjax.study.variations import (
     MultivariateNormal,
     Normal,
     Uniform,
-    posterior_variation,
-    stated_variations,
 )
 
 MEAN, COVARIANCE = np.array([3.0, -1.0]), np.array([[0.04, 0.03], [0.03, 0.09]])
@@ -71,37 +65,6 @@ def test_what_derivatives_are_taken_by_is_what_members_are_drawn_from(one):
     unit = np.random.default_rng(0).random((50, len(one.names)))
     values = one.at(jnp.asarray(stats.norm.ppf(unit)))
     np.testing.assert_allclose(values, one.quantiles(unit), rtol=1e-12)
-
-
-def test_a_models_own_deviations_and_a_calibrations_posterior_vary():
-    model = with_stated_std(curved_beam(), ["mode_1.natural_frequency"], jnp.array([0.4]))
-    (own,) = stated_variations(model)
-    assert (own.names, own.std) == (("mode_1.natural_frequency",), 0.4)
-    assert own.mean == pytest.approx(2 * np.pi * 64.78, rel=1e-12)
-    with pytest.raises(ValueError, match="states no standard deviation"):
-        stated_variations(curved_beam())
-    names = ("mode_1.damping_ratio", "mode_1.natural_frequency")
-    fields = {
-        "model": curved_beam(),
-        "values": np.array([0.05, 400.0]),
-        "covariance": np.array([[1e-6, 2e-5], [2e-5, 4e-3]]),
-        "residuals": np.zeros((1, 2)),
-        "state_converged": np.array([True]),
-        "level_gain": np.zeros(1),
-        "level_phase": np.zeros(1),
-        "reduced_chi_square": 1.0,
-        "names": names,
-        "noise_stated": True,
-        "notes": (),
-    }
-    good = next(status for status in MinimisationStatus if status.found_minimum)
-    posterior = posterior_variation(CalibratedModel(status=good, **fields))
-    assert posterior.names == names
-    np.testing.assert_array_equal(posterior.mean, fields["values"])
-    np.testing.assert_array_equal(posterior.covariance, fields["covariance"])
-    bad = next(status for status in MinimisationStatus if not status.found_minimum)
-    with pytest.raises(ValueError, match="did not converge"):
-        posterior_variation(CalibratedModel(status=bad, **fields))
 
 
 def test_values_in_a_sample_are_taken_equally_often():

@@ -11,10 +11,9 @@ import numpy as np
 
 from snrmjax.diagnose.kinds.hypothesis import Hypothesis, Start
 from snrmjax.diagnose.kinds.table import HYPOTHESES
-from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractEffect, AbstractForce
 from snrmjax.model.effect_metadata import Entries, MotionScales
-from snrmjax.model.effect_shape import shape_of
+from snrmjax.model.effect_shape import averaged_effect, shape_of
 from snrmjax.model.effects import effect_class, is_own
 from snrmjax.numerics.rules import InputError
 

@@ -1,4 +1,8 @@
-"""Fits of force laws at an attachment point to the sensors' records."""
+"""Fits of force laws at an attachment point to the sensors' records.
+
+Stuck dry friction has any reaction up to the friction limit: evaluated along a motion below its
+measurement error, its law would give the full force in the direction of that error.
+"""
 
 from typing import Any, NamedTuple
 
@@ -15,12 +19,12 @@ from snrmjax.diagnose.location.element_motion import (
     force_along,
 )
 from snrmjax.diagnose.location.source_patterns import SensorRecords, SourceFit, SourcePattern
-from snrmjax.diagnose.location.stuck_friction import stuck_forces
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.library.friction import CoulombFriction
 
+_FIRST_OF_SQUARE = 4 / np.pi  # fundamental of a square wave of height 1
 _SMALL = 1e-3  # of 1σ, step of finite differences by the records' errors
 _ROUNDING = 1e-9
 _ROUNDS = 6  # most reweighted fits, the first with independent errors
@@ -34,6 +38,32 @@ _STARTS = 3  # starts of a law that does not fit from the first
 _OUTLYING = 3.0  # 1σ, scale of the Cauchy loss ρ(r) = 9 log(1 + r²/9)
 _OF_NOISE = 0.8741  # mean of ρ for normal r
 _NOISE_RATIO = 1.2  # ratio of misfit to noise up to which a law fits
+
+
+def stuck_forces(
+    limit: float, required: Complex[np.ndarray, " state"], element: SurroundedElement
+) -> ElementForces:
+    """The forces of stuck friction: the required ones, up to the fundamental of full sliding.
+
+    Arguments: `limit`: friction limit in N; `required`: fundamental of the force that the sensors
+    require in each state. The motion is unchanged, and the force has no other harmonics.
+    """
+    capacity, magnitude = _FIRST_OF_SQUARE * limit, np.abs(required)
+    sliding = magnitude > capacity
+    direction = required / np.where(magnitude > 0, magnitude, 1.0)
+    n_states, n_orders = element.motion.shape
+    force = np.zeros((n_states, n_orders), dtype=complex)
+    force[:, 1] = np.where(sliding, capacity * direction, required)
+    by_parameter = np.zeros((n_states, n_orders, 1), dtype=complex)
+    by_parameter[:, 1, 0] = np.where(sliding, _FIRST_OF_SQUARE * direction, 0.0)
+    return ElementForces(
+        force,
+        element.motion,
+        by_parameter,
+        by_motion=np.zeros((n_states, n_orders, 2), dtype=complex),
+        slopes=np.zeros((n_states, 2 * n_orders - 1, 2 * n_orders - 3)),
+        settled=np.ones(n_states, dtype=bool),
+    )
 
 
 class LocatedLaw(NamedTuple):

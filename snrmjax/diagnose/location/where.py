@@ -28,6 +28,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import on_one_core, over_cores
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import with_former_attributes
 from snrmjax.numerics.result import AbstractResult, quantity, setting
 from snrmjax.numerics.rules import InputError
 
@@ -55,6 +56,14 @@ class LocatedForce(NamedTuple):
     laws: dict[str, float]  # probabilities of laws there, given one of them
 
 
+@with_former_attributes(
+    {
+        "told": "is_determined",
+        "settled_by": "separating_sensor",
+        "places": "candidates",
+        "by_place": "probabilities",
+    }
+)
 class Localisation(AbstractResult):
     """Locations of a nonlinear force, the most probable first; see `locate_force`.
 
@@ -64,9 +73,9 @@ class Localisation(AbstractResult):
 
     coordinates: ClassVar[tuple[str, ...]] = ("place",)
 
-    places: tuple[LocatedForce, ...]
+    candidates: tuple[LocatedForce, ...]
     model: Structure  # with the law at the most probable location
-    settled_by: str | None  # the best additional sensor to separate the two most probable
+    separating_sensor: str | None  # the best additional sensor to separate the two most probable
     name: tuple[str, ...] = quantity("place", "", "place", name="place", static=True)
     probability: Float[np.ndarray, " place"] = quantity("place", "1", "probability")
     misfit: float = setting()
@@ -74,33 +83,33 @@ class Localisation(AbstractResult):
     @property
     def words(self) -> Fact:
         """Where the force acts, as far as determined."""
-        first, second = self.places[:2]
+        first, second = self.candidates[:2]
         values = {
             "place": first.name,
             "probability": first.probability,
             "other": second.name,
             "misfit": self.misfit,
-            "sensor": self.settled_by,
+            "sensor": self.separating_sensor,
         }
         if not self.fits:
             law = first.law
             return Fact("no_place_fits", **values, kind="" if law is None else law.kind)
-        if self.told:
+        if self.is_determined:
             return Fact("force_placed", **values)
         return Fact("force_not_placed", **values)
 
     @property
     def answer(self) -> Fact:
         """The located law as an answer, where no effect on the mode explains the states."""
-        law = self.places[0].law
+        law = self.candidates[0].law
         return Fact("placed_law_explains", kind="" if law is None else law.kind)
 
     @property
     def explains(self) -> bool:
         """Whether a law at one location, other than a distributed one, fits within noise."""
-        first = self.places[0]
+        first = self.candidates[0]
         fits = first.law is not None and first.law.fits
-        return self.told and first.influence is not None and fits
+        return self.is_determined and first.influence is not None and fits
 
     @property
     def fits(self) -> bool:
@@ -108,24 +117,24 @@ class Localisation(AbstractResult):
         return not self.misfit > _NOT_THERE
 
     @property
-    def told(self) -> bool:
+    def is_determined(self) -> bool:
         """Whether one location is more probable than all others together."""
         return bool(self.probability[0] > _SURE)
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
-        head = self.name[0] if self.told else "not determined"
+        head = self.name[0] if self.is_determined else "not determined"
         head = head if self.fits else "none of these candidates"
         lines = [f"Localisation: {head}"]
-        for location in self.places:
+        for location in self.candidates:
             law = "" if location.law is None else f", as {location.law.kind}"
             lines.append(f"{location.name}: {location.probability:.3g}{law}")
-        if not self.told and self.settled_by is not None:
-            lines.append(f"a sensor at {self.settled_by} would separate the first two")
+        if not self.is_determined and self.separating_sensor is not None:
+            lines.append(f"a sensor at {self.separating_sensor} would separate the first two")
         return (*lines, f"misfit of the best: {self.misfit:.3g} times the noise")
 
     @property
-    def by_place(self) -> dict[str, float]:
+    def probabilities(self) -> dict[str, float]:
         """Probabilities by location, as in `diagnosis.json`."""
         return dict(zip(self.name, self.probability.tolist(), strict=True))
 
@@ -183,9 +192,9 @@ def locate_force(
         for name, p in zip(names, probability[order], strict=True)
     )
     return Localisation(
-        places=located,
+        candidates=located,
         model=_completed(model, located[0]),
-        settled_by=_settling_point(chosen, modes, [vectors[name][1] for name in names[:2]]),
+        separating_sensor=_settling_point(chosen, modes, [vectors[name][1] for name in names[:2]]),
         name=names,
         probability=probability[order],
         misfit=float(np.sqrt(misfit)),

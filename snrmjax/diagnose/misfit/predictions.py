@@ -129,16 +129,13 @@ class Predictions:
         return dataclasses.replace(self, offset=offset)
 
     def of_records(
-        self,
-        data: SteadyStates,
-        added: Float[np.ndarray, "state input"],
-        harmonics: int | None = None,
+        self, data: SteadyStates, added: Float[np.ndarray, "state input"]
     ) -> "Predictions":
         """The predictions at records with `added` corrections; the offset follows with weighting.
 
-        Arguments: `data`: as measured; `harmonics`: of the motions, as before if None.
+        Arguments: `data`: as measured.
         """
-        order = self.compared.harmonic_order if harmonics is None else harmonics
+        order = self.compared.harmonic_order
         corrected = with_corrected_records(data, self.chosen.rows, self.chosen.sensors, added)
         records = _records(self.given, corrected, order, self.error_scale)
         return dataclasses.replace(self, **records, added=added)

@@ -10,12 +10,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from snrmjax.identify.calibrate.calibrated_model import AbstractCalibration
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
-from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.identify.pointwise.inversion import PointStatus
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.least_squares import root_of_inverse
-from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
+from snrmjax.numerics.levenberg_marquardt import (
+    MinimisationStatus,
+    StepRule,
+    minimise,
+    root_of_inverse,
+)
 from snrmjax.numerics.result import Variable, quantity
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ

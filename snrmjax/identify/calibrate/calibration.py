@@ -35,11 +35,12 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
-from snrmjax.numerics.least_squares import inverse_of
-from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, inverse_of
+from snrmjax.numerics.names import with_former_arguments
 from snrmjax.numerics.rules import InputError
 
 
+@with_former_arguments({"held_modes": "prescribed_modes"})
 @on_numbers("Differentiate the force that a motion needs: `sj.identify.inverse_force`.")
 def calibrate_model(
     model: Structure,
@@ -50,7 +51,7 @@ def calibrate_model(
     level_gain_std: float = 0.0,
     level_phase_std: float = 0.0,
     priors: bool = False,
-    held_modes: Sequence[int] = (),
+    prescribed_modes: Sequence[int] = (),
 ) -> CalibratedModel:
     """Fit parameters of a model to measured steady states of all levels at once.
 
@@ -64,9 +65,9 @@ def calibrate_model(
     Arguments: `model` has the starting values and all that is not fitted; `parameters` are chosen
     from `parameter_names`. `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ of errors
     common to all velocities of a level, which become unknowns. With `priors` the model's stated
-    standard deviations of fitted parameters act as Gaussian priors. `held_modes` (counted from 0)
-    are modes that may exchange energy: their motions at all recorded orders are prescribed as
-    measured, for as many modes as there are sensors, and the force residuals of these modes are
+    standard deviations of fitted parameters act as Gaussian priors. `prescribed_modes` (counted
+    from 0) are modes that may exchange energy: their motions at all recorded orders are prescribed
+    as measured, for as many modes as there are sensors, and the force residuals of these modes are
     minimised. Inside an internal resonance no branch has to be chosen. Every state needs all
     sensors.
     Returns a `CalibratedModel`; its status and notes report a fit that did not converge and states
@@ -75,8 +76,8 @@ def calibrate_model(
     Raises `ValueError` for unknown or repeated names, for sensors other than the model's, for an
     unknown force or phase, for levels' errors below zero and for too few data.
     Validity: motions with the period of the force. Errors of velocity enter to first order. Inside
-    an internal resonance several motions share one fundamental; without `held_modes` the one that
-    continues from small amplitudes is taken.
+    an internal resonance several motions share one fundamental; without `prescribed_modes` the one
+    that continues from small amplitudes is taken.
     Not differentiable: differentiate `inverse_force`.
     Reference: the formulation is this package's own.
     """
@@ -88,12 +89,14 @@ def calibrate_model(
     check_phases(data, "a calibration")
     chosen = calibration_states(model, data, harmonic_order)
     prescribed: tuple[tuple[int, ...], ...] = ()
-    if held_modes:
-        _check_prescribed(model, tuple(held_modes))
+    if prescribed_modes:
+        _check_prescribed(model, tuple(prescribed_modes))
         chosen = prescribed_mode_columns(chosen)
         typical = float(np.median(np.asarray(chosen.states.frequency)))
         orders = (1, *chosen.orders)
-        prescribed = prescribed_at_orders(model, held_modes, typical, orders, len(chosen.sensors))
+        prescribed = prescribed_at_orders(
+            model, prescribed_modes, typical, orders, len(chosen.sensors)
+        )
     shared = tuple(name for name, value in level_std.items() if value > 0)
     picked = (chosen.sensors, chosen.orders, harmonic_order, shared, chosen.n_levels)
     settings = FitSettings(names, *picked, prescribed)
@@ -116,7 +119,8 @@ def calibrate_model(
 def _check_prescribed(model: Structure, modes: tuple[int, ...]) -> None:
     if len(set(modes)) < len(modes) or not set(modes) <= set(range(model.n_modes)):
         raise InputError(
-            f"`held_modes` must be different modes from 0 to {model.n_modes - 1}, but is {modes}."
+            f"`prescribed_modes` must be different modes from 0 to {model.n_modes - 1}, but is "
+            f"{modes}."
         )
 
 

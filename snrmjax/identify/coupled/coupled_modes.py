@@ -185,8 +185,8 @@ def coupled_modes(
     Candidates are modes near the first, second or third harmonic of the measured frequencies (1:1,
     1:2, 1:3). For each, the potential gets the cubic and quartic terms of both modes that matter at
     that ratio, and their coefficients are fitted with the motions of both modes prescribed as
-    measured (`calibrate_model` with `held_modes`): no branch has to be chosen. Terms are selected
-    by their evidence and fitted once more.
+    measured (`calibrate_model` with `prescribed_modes`): no branch has to be chosen. Terms are
+    selected by their evidence and fitted once more.
 
     Arguments: `data` of sensors that observe both modes, best two or more with harmonics and their
     errors; without the second harmonic, 1:2 and cubic terms are left out. `model` with both modes
@@ -342,7 +342,7 @@ def _fitted(
     fields = ("natural_frequency", "damping_ratio")
     linear = [f"mode_{k + 1}.{field}" for k in prescribed for field in fields]
     names += [name for name in linear if name in stated_stds(model)]
-    return calibrate_model(wide, data, names, priors=True, held_modes=prescribed, **settings)
+    return calibrate_model(wide, data, names, priors=True, prescribed_modes=prescribed, **settings)
 
 
 def _chosen(

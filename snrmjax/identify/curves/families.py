@@ -2,7 +2,7 @@
 
 import itertools
 from abc import abstractmethod
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from snrmjax.identify.curves.family_base import (
     Terms,
 )
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline, spline_terms
+from snrmjax.numerics.names import take_former
 from snrmjax.numerics.rules import InputError
 
 
@@ -212,31 +213,37 @@ _KNOTS, _REACH = 64, 1.3  # of the spline in programs; its end over the largest 
 
 
 class OwnFamily(AbstractFamily):
-    """ω̃² or 2ζ̃ω̃ as Σ p_k h_k(x; numbers) of the amplitude x over the largest measured one.
+    """ω̃² or 2ζ̃ω̃ as Σ p_k h_k(x; s) of the amplitude x over the largest measured one.
 
-    A subclass has a `kind`, `names` of its terms, the nonlinear parameters `numbers`, each with its
+    A subclass has a `kind`, `names` of its terms, the `nonlinear_parameters` s, each with its
     positive starting values, and `columns`. Added to `sj.identify.FAMILIES` under its kind,
-    `fit_jointly` takes it by name. Numbers are unknowns by their logarithm, with a prior 1σ of a
-    factor of twenty about one. Response prediction uses a natural spline through 64 values of the
-    curve, linearised in the numbers.
+    `fit_jointly` takes it by name. Nonlinear parameters are unknowns by their logarithm, with a
+    prior 1σ of a factor of twenty about one. Response prediction uses a natural spline through 64
+    values of the curve, linearised in them.
     """
 
     names: ClassVar[tuple[str, ...]]
-    numbers: ClassVar[dict[str, tuple[float, ...]]] = {}
+    nonlinear_parameters: ClassVar[dict[str, tuple[float, ...]]] = {}
     orders: ClassVar[tuple[int, ...]] = (0,)
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        take_former(cls, {"numbers": "nonlinear_parameters"})
 
     @classmethod
     @abstractmethod
-    def columns(cls, x: Float[Array, "*batch"], **numbers: Float[Array, ""]) -> list[Array]:
+    def columns(cls, x: Float[Array, "*batch"], **shapes: Float[Array, ""]) -> list[Array]:
         """The terms h_k at relative amplitudes x > 0, in JAX operations and in the order of
-        `names`.
+        `names`; `shapes` are the nonlinear parameters.
         """
 
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """See `AbstractCurve`."""
         x = jnp.maximum(jnp.asarray(amplitude) / self.scale, _LEAST)
         own, n = jnp.asarray(self.parameters), len(self.names)
-        terms = self.columns(x, **dict(zip(self.numbers, jnp.exp(own[n:]), strict=True)))
+        terms = self.columns(
+            x, **dict(zip(self.nonlinear_parameters, jnp.exp(own[n:]), strict=True))
+        )
         return sum(
             (coefficient * term for coefficient, term in zip(own[:n], terms, strict=True)), 0.0 * x
         )
@@ -261,20 +268,22 @@ class OwnFamily(AbstractFamily):
 
     def expected_std(self) -> Float[np.ndarray, " parameter"]:
         """See `AbstractFamily`."""
-        return np.repeat([np.inf, _LOGARITHM_STD], [len(self.names), len(self.numbers)])
+        return np.repeat(
+            [np.inf, _LOGARITHM_STD], [len(self.names), len(self.nonlinear_parameters)]
+        )
 
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
         values = (Coefficient(name, True) for name in self.names)
-        return (*values, *(Coefficient(f"log_{name}", False) for name in self.numbers))
+        return (*values, *(Coefficient(f"log_{name}", False) for name in self.nonlinear_parameters))
 
     @classmethod
     def starts(cls, order: int, near: Scattered) -> list[AbstractFamily]:
-        """See `AbstractFamily`: one at every combination of starting values of the numbers."""
+        """See `AbstractFamily`: one at every combination of starting values."""
         members: list[AbstractFamily] = []
         n, scale = len(cls.names), jnp.asarray(near.largest)
-        for numbers in itertools.product(*cls.numbers.values()):
-            blank = cls(jnp.append(jnp.ones(n), jnp.log(jnp.array(numbers))), scale, near.argument)
+        for shapes in itertools.product(*cls.nonlinear_parameters.values()):
+            blank = cls(jnp.append(jnp.ones(n), jnp.log(jnp.array(shapes))), scale, near.argument)
             start = near.fitted(blank.linearised(near.amplitude).by_parameters[:, :n])
             members.append(blank.at(np.append(start, blank.parameters[n:])))
         return members

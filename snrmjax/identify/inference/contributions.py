@@ -13,7 +13,7 @@ from snrmjax.identify.joint.free_unknowns import padded_problem, whitened_slopes
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.compiled import on_numbers
-from snrmjax.numerics.least_squares import inverse_of
+from snrmjax.numerics.levenberg_marquardt import inverse_of
 from snrmjax.numerics.result import AbstractResult, Variable
 
 Row = TypeVar("Row")

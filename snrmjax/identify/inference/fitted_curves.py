@@ -11,6 +11,7 @@ from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, banded_values
 from snrmjax.numerics.compiled import on_numbers
+from snrmjax.numerics.names import with_former_arguments
 from snrmjax.numerics.rules import InputError
 
 _SCAN = 256  # displacements at which the backbone is sampled to bracket a velocity
@@ -19,18 +20,19 @@ _KNOTS = 120  # of a named family interpolated as a `Backbone`
 _DOUBLINGS = 6  # of the displacement range, to reach a velocity
 
 
+@with_former_arguments({"of_a_new_level": "include_level_variance"})
 @on_numbers("Differentiate `sj.identify.refit`.")
 def fitted_values(
     fit: JointFit,
     velocity: Float[np.ndarray, " point"] | None = None,
     *,
     displacement: Float[np.ndarray, " point"] | None = None,
-    of_a_new_level: bool = False,
+    include_level_variance: bool = False,
 ) -> BackboneValues:
     """ω̃ and ζ̃ at amplitudes on the backbone, with 1σ at that amplitude.
 
-    Arguments: either `velocity` in m/s or `displacement` in m, zero allowed. With `of_a_new_level`
-    the bands are predictive: they include level-to-level variation.
+    Arguments: either `velocity` in m/s or `displacement` in m, zero allowed. With
+    `include_level_variance` the bands are predictive: they include level-to-level variation.
     Raises `ValueError` for a velocity that the backbone has at several displacements, possible
     where it softens: give displacements there.
     Not differentiable: differentiate `snrmjax.identify.refit`.
@@ -43,7 +45,7 @@ def fitted_values(
         curves = values_at_displacement(fit, np.asarray(displacement, np.float64))
     covariance = np.einsum("ocp,pq,odq->ocd", curves.slopes, fit.covariance, curves.slopes)
     squared, damping = curves.values.T
-    if of_a_new_level:
+    if include_level_variance:
         stiffness, dissipation = np.asarray(fit.prior.new_level)[2:]
         covariance[:, 0, 0] += (squared * stiffness) ** 2
         covariance[:, 1, 1] += (damping * dissipation) ** 2

@@ -96,7 +96,7 @@ def fitted_response(
 
     Arguments: `force` in N, frequencies in rad/s; curves end at `largest_amplitude_ratio` times
     the largest measured amplitude, extrapolated beyond the data; `of` the predicted level, by
-    default `new_level`'s (`ON_THE_CURVES`: the fitted mode itself).
+    default `new_level`'s (`WITHOUT_LEVEL_ERRORS`: the fitted mode itself).
     Returns the connected curves, the main one first; resonances and folds are listed with the first
     curve that has them; `note` reports extrapolation.
     Raises `ValueError` for a force or a ratio that is not positive.

@@ -16,7 +16,7 @@ from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.prediction import Resonance
 from snrmjax.identify.pointwise.snrm import is_single, sensed_mode
-from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
+from snrmjax.identify.prediction.new_level import WITHOUT_LEVEL_ERRORS, NewLevel
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.blocks import by_blocks
@@ -47,7 +47,9 @@ class ForcedMotion(eqx.Module):
     sensor: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, fit: JointFit, force: float, new: NewLevel = ON_THE_CURVES) -> "ForcedMotion":
+    def of(
+        cls, fit: JointFit, force: float, new: NewLevel = WITHOUT_LEVEL_ERRORS
+    ) -> "ForcedMotion":
         """A fit under a force in N, or under the record of `new`."""
         return cls(
             unravel=fit.packed().unravel,
@@ -214,7 +216,7 @@ class SolvedPoint(NamedTuple):
 
 
 def located(
-    fit: JointFit, force: float, start: InitialPoint, new: NewLevel = ON_THE_CURVES
+    fit: JointFit, force: float, start: InitialPoint, new: NewLevel = WITHOUT_LEVEL_ERRORS
 ) -> FittedPoint:
     """The resonance or fold near an initial point.
 
@@ -253,7 +255,7 @@ def turning_points(frequency: np.ndarray, amplitude: np.ndarray) -> list[Initial
 
 
 def solved_point(
-    fit: JointFit, force: float, start: InitialPoint, new: NewLevel = ON_THE_CURVES
+    fit: JointFit, force: float, start: InitialPoint, new: NewLevel = WITHOUT_LEVEL_ERRORS
 ) -> SolvedPoint | None:
     """Frequency, velocity and displacement of a point, and their derivatives by the unknowns."""
     program, motion = fit.packed(), ForcedMotion.of(fit, force, new)

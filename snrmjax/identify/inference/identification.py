@@ -20,7 +20,7 @@ from snrmjax.identify.pointwise.backbone_points import (
     off_resonance_error_factor,
     peak_ratio,
 )
-from snrmjax.identify.pointwise.inversion_result import PointStatus, reasons_in_words
+from snrmjax.identify.pointwise.inversion import PointStatus, reasons_in_words
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
@@ -171,7 +171,7 @@ def identification_of_fit(
     `identify_backbone`.
     Returns an `Identification` whose `notes` are those of the fit and of the points.
     """
-    points = identify_points(data, fit.modes_found, amplitude=amplitude, measure=measure)
+    points = identify_points(data, fit.identified_modes, amplitude=amplitude, measure=measure)
     curves = as_backbone(fit, argument=amplitude)
     identified = Identification(points, curves, fit, ())
     if not fit.noise.stated:
@@ -186,7 +186,7 @@ def identification_of_fit(
             level_phase=phase,
             frequency_std=float(np.hypot(identified.level_frequency_std, frequency_jitter_std)),
             damping_std=identified.level_damping_std,
-            modal_mass_std=fit.modes_found.own_modal_mass_std,
+            modal_mass_std=fit.identified_modes.own_modal_mass_std,
         )
     notes = (
         *fit.notes,

@@ -52,6 +52,7 @@ from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import on_numbers
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.names import with_former_attributes
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
@@ -59,6 +60,7 @@ from snrmjax.numerics.units import HERTZ
 _MOVED = 2.0  # standard deviations from which a level error is reported
 
 
+@with_former_attributes({"modes_found": "identified_modes"})
 class JointFit(AbstractResult):
     """Both fitted curves, all other unknowns, and their covariance.
 
@@ -116,7 +118,7 @@ class JointFit(AbstractResult):
         return displacement, velocity
 
     @property
-    def modes_found(self) -> LinearModes:
+    def identified_modes(self) -> LinearModes:
         """The linear modes with the fitted modal mass of the mode of interest.
 
         Its 1σ, where one was stated, is the fit's.

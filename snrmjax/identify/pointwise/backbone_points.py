@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.identify.curves.family_base import Argument
-from snrmjax.identify.pointwise.inversion import closed_form, invert_phasor
-from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
+from snrmjax.identify.pointwise.inversion import PointStatus, SnrmPoints, closed_form, invert_phasor
 from snrmjax.identify.pointwise.snrm import (
     SensedMode,
     is_single,
@@ -19,8 +18,7 @@ from snrmjax.identify.pointwise.snrm import (
     reference_sensor,
     sensed_mode,
 )
-from snrmjax.measure.indicators import appropriation_of
-from snrmjax.measure.signals import peak_amplitude
+from snrmjax.measure.signals import appropriation_of, peak_amplitude
 from snrmjax.measure.states import SteadyStates, check_force, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.compiled import as_numpy, compiled

@@ -53,7 +53,7 @@ class NewLevel(NamedTuple):
         return float(participation_of(self.forced) / participation_of(fit.modes))
 
 
-ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))
+WITHOUT_LEVEL_ERRORS = NewLevel(np.zeros(len(LEVEL_ERRORS)))
 """The fitted curves themselves, without level errors, under a force in newtons."""
 
 

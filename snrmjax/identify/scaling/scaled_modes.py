@@ -85,7 +85,7 @@ class ScaledModes(AbstractResult):
                 self.damping_ratio_std,
                 self.modal_mass_std if known else None,
             ),
-            beside=OptionalModalData(base=self.base),
+            optional=OptionalModalData(base=self.base),
         )
 
     def summary(self) -> tuple[str, ...]:

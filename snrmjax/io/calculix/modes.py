@@ -9,8 +9,14 @@ from jaxtyping import Float
 
 from snrmjax.condense.load_cases import ReductionBasis
 from snrmjax.io.calculix.deck import Deck
-from snrmjax.io.calculix.jobs import Calculix, find_calculix, model_file, run_job
-from snrmjax.io.calculix.results import eigenvalues, printed_tables
+from snrmjax.io.calculix.jobs import (
+    Calculix,
+    eigenvalues,
+    find_calculix,
+    model_file,
+    printed_tables,
+    run_job,
+)
 from snrmjax.io.files import FilePath
 from snrmjax.numerics.rules import InputError
 

@@ -13,6 +13,7 @@ from snrmjax.io.calculix.modes import DeckModes, modes_of_deck
 from snrmjax.io.calculix.static import STEP_OF_CASES, run_static_cases
 from snrmjax.io.files import FilePath
 from snrmjax.numerics.facts import Fact
+from snrmjax.numerics.rules import InputError
 
 NodeDirection = tuple[int, str]
 """A node's number and a direction, "x", "y" or "z"."""
@@ -43,7 +44,7 @@ def read_deck_source(
     job_folder = Path(path).with_suffix(".jobs") if folder is None else Path(folder)
     try:
         modes = modes_of_deck(deck, numbers, job_folder, program=program, time_limit=time_limit)
-    except ValueError:
+    except InputError:
         _remove_unused(job_folder)
         raise
     largest = _largest(modes)

@@ -20,11 +20,12 @@ from snrmjax.io.calculix.jobs import (
     JobOutcome,
     deck_digest,
     find_calculix,
+    last_energy,
     model_file,
+    printed_tables,
     run_job,
 )
 from snrmjax.io.calculix.modes import ALL_NODES, DeckModes, all_nodes, load_rows
-from snrmjax.io.calculix.results import last_energy, printed_tables
 from snrmjax.io.files import FilePath, write_atomically
 from snrmjax.numerics.rules import InputError
 

@@ -19,11 +19,13 @@ from snrmjax.io.laboratory.physical_units import (
     UnitMeaning,
     amplitude_kind,
     level_reference,
+    meaning_or_none,
     unit_meaning,
 )
 from snrmjax.measure.recordings.channels import DERIVATIVE, Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.rules import InputError
 
 _TO_FILL_IN = re.compile(r"\b(COLUMN|CHANNEL|QUANTITY|UNIT|NEWTONS|AMPLITUDE|SENSOR)\b")
 _OTHERS = (
@@ -150,7 +152,7 @@ def _question(paths: Sequence[Path], content: _Content, options: _Options) -> st
             mapped_record(content, mapping, content.name or "the record", Assumptions())
         else:
             import_files(list(paths), mapping, tuple(options))
-    except ValueError as error:
+    except InputError as error:
         return str(error)
     return ""
 
@@ -186,9 +188,8 @@ class _Motion(NamedTuple):
 
 def _motion_of(name: str, unit: str, role: str) -> _Motion:
     reference = level_reference(unit)
-    try:
-        meaning = unit_meaning(unit if reference is None else reference)
-    except ValueError:
+    meaning = meaning_or_none(unit if reference is None else reference)
+    if meaning is None:
         return _Motion(name, role, None, False)
     if reference == "":
         return _Motion(name, role, None, False, "dB re UNIT")

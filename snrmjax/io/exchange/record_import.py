@@ -158,7 +158,7 @@ def import_record(
             else:
                 swept = sweep_states(*signals, **settings)
                 states, notes, counts = swept.states, swept.notes, None
-        except ValueError as error:
+        except InputError as error:
             failures.append(f"{kind}: {error}")
             continue
         if not mapping.record:
@@ -194,5 +194,5 @@ def record_columns(record: TimeRecording, mapping: ImportMap) -> dict[str, Chann
 def _number(record: TimeRecording, name: str, file: str, option: str) -> int:
     try:
         return channel_number(record.channels, name)
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{option}: in {file} {error}") from error

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.io.exchange.decibels import with_stated_references
 from snrmjax.io.exchange.import_levels import MeasuredPart
 from snrmjax.io.exchange.import_map import BY_NAME, Assumptions, ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
@@ -18,6 +17,7 @@ from snrmjax.io.exchange.import_units import (
     motion_meaning,
     phase_in_rad,
     require_name,
+    with_stated_references,
 )
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.names import label_of, role_of

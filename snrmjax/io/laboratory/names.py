@@ -7,6 +7,7 @@ from typing import NamedTuple
 from snrmjax.io.laboratory.physical_units import (
     amplitude_words_removed,
     level_reference,
+    meaning_or_none,
     unit_in_table,
     unit_meaning,
     without_amplitude_kind,
@@ -183,9 +184,8 @@ def role_of(name: str, unit: str = "") -> str:
     stated = unit or label.unit
     if by_name == "level" and level_reference(stated) is not None:
         by_name = "amplitude"  # a level in dB numbers no levels of a test
-    try:
-        meaning = unit_meaning(level_reference(stated) or stated)
-    except ValueError:
+    meaning = meaning_or_none(level_reference(stated) or stated)
+    if meaning is None:
         return by_name
     by_unit = _BY_UNIT.get(meaning.dimension, "")
     is_drive = by_unit == "drive" and by_name != "drive"  # any sensor may be in volts

@@ -170,6 +170,14 @@ def unit_meaning(text: str) -> UnitMeaning:
     return UnitMeaning(dimension, value * factor, amplitude)
 
 
+def meaning_or_none(text: str) -> UnitMeaning | None:
+    """`unit_meaning` of a text, or None where it is no unit."""
+    try:
+        return unit_meaning(text)
+    except InputError:
+        return None
+
+
 def level_reference(text: str) -> str | None:
     """The reference of a level in dB as a unit, "" if unknown, None if no level.
 
@@ -233,11 +241,7 @@ def unit_in_table(text: str) -> str:
     if not re.match(r"[^\W\d]|[(°]", plain) or not all(known.values()):
         return ""
     plain = re.sub(r"[A-Za-z]+", lambda match: known.get(match[0], match[0]), plain)
-    try:
-        unit_meaning(plain)
-    except ValueError:
-        return ""
-    return plain
+    return "" if meaning_or_none(plain) is None else plain
 
 
 def channel_meaning(text: str) -> tuple[Quantity, float]:
@@ -245,21 +249,16 @@ def channel_meaning(text: str) -> tuple[Quantity, float]:
 
     For a motion per force they are those of the motion, per newton.
     """
-    try:
-        meaning = unit_meaning(text)
-    except ValueError:
-        return "unknown", 1.0
-    if meaning.quantity == "unknown" or meaning.per_volt:
+    meaning = meaning_or_none(text)
+    if meaning is None or meaning.quantity == "unknown" or meaning.per_volt:
         return "unknown", 1.0
     return meaning.quantity, meaning.factor
 
 
 def is_per_force(text: str) -> bool:
     """Whether a unit is a motion per force, as "g/N"."""
-    try:
-        return unit_meaning(text).per_force
-    except ValueError:
-        return False
+    meaning = meaning_or_none(text)
+    return meaning is not None and meaning.per_force
 
 
 def _not_understood(text: str, why: str = "") -> InputError:

@@ -9,8 +9,12 @@ from jaxtyping import Float
 from snrmjax.io.files import FilePath
 from snrmjax.io.laboratory.names import column_unit
 from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference
-from snrmjax.io.laboratory.printed_times import PrintedRate, rate_of_printed_times
-from snrmjax.io.laboratory.uneven_times import odd_step, resampled
+from snrmjax.io.laboratory.printed_times import (
+    PrintedRate,
+    odd_step,
+    rate_of_printed_times,
+    resampled,
+)
 from snrmjax.io.rows import header_of, read_cells
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording

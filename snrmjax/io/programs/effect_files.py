@@ -34,7 +34,7 @@ def load_effects(path: str | os.PathLike[str]) -> None:
         for effect in _defined(module):
             if effect not in known_effects().values():
                 register_effect(effect)
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{file.name} cannot be loaded: {error}") from error
     if not {*known_effects()} - before:
         raise InputError(

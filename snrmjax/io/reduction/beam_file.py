@@ -32,7 +32,8 @@ inertia_kg_m2 = 2e-8                 # optional, about the axis of bending
 
 import numpy as np
 
-from snrmjax.condense.beam_description import (
+from snrmjax.condense.beam_models import BeamModels
+from snrmjax.condense.beam_parameters import (
     LENGTH,
     MAX_RISE,
     POISSON,
@@ -44,7 +45,6 @@ from snrmjax.condense.beam_description import (
     BeamDescription,
     unconstrained_motion,
 )
-from snrmjax.condense.beam_models import BeamModels
 from snrmjax.condense.beam_source import beam_source
 from snrmjax.condense.reduction import ReductionSource, run_load_cases
 from snrmjax.io.files import FilePath, file_name, read_text

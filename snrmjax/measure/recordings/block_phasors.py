@@ -12,6 +12,7 @@ from jaxtyping import Complex, Float
 from snrmjax.measure.recordings.time_recording import TimeRecording
 
 _MOST_SAMPLES = 2**20  # of all channels together, per read
+_BLOCKS = 64  # of a stretch, about
 _LONGEST_BLOCK = 2**16  # samples
 _FEWEST_SAMPLES = 3  # per unknown of a block
 _FLAT = 0.06  # of a cycle at the largest value, above which a record is clipped
@@ -41,13 +42,13 @@ class BlockPhasors(NamedTuple):
         return self._replace(phasors=self.phasors * rotation, frequency=self.frequency + shift)
 
 
-def block_length(samples: int, cycle: float, unknowns: int, blocks: int) -> int:
-    """Samples per block: about whole cycles, about `blocks` blocks, long enough for the fit.
+def block_length(samples: int, cycle: float, unknowns: int) -> int:
+    """Samples per block: about whole cycles, about 64 blocks, long enough for the fit.
 
     `cycle` in samples.
     """
     least = np.ceil(_FEWEST_SAMPLES * unknowns / cycle)
-    cycles = max(1.0, least, min(np.floor(samples / cycle / blocks), _LONGEST_BLOCK // cycle))
+    cycles = max(1.0, least, min(np.floor(samples / cycle / _BLOCKS), _LONGEST_BLOCK // cycle))
     return round(cycles * cycle)
 
 
@@ -58,15 +59,13 @@ def block_phasors(
     stop: int,
     frequency: float,
     highest: int,
-    *,
-    blocks: int = 64,
 ) -> BlockPhasors:
-    """Phasors of harmonics 1 to `highest` of samples `start` to `stop`, in about `blocks` blocks.
+    """Phasors of harmonics 1 to `highest` of samples `start` to `stop`, in about 64 blocks.
 
     Arguments: `frequency` in rad/s. The stretch is read in pieces.
     """
     step = frequency / recording.sampling_rate
-    length = block_length(stop - start, 2 * np.pi / step, 2 * highest + 1, blocks)
+    length = block_length(stop - start, 2 * np.pi / step, 2 * highest + 1)
     count = max(1, (stop - start) // length)
     angle = step * (np.arange(length) - (length - 1) / 2)
     angles = np.outer(np.arange(1, highest + 1), angle)

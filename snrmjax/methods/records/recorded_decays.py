@@ -1,18 +1,25 @@
-"""The mode of interest isolated in every free decay of a record, and the methods for it."""
+"""The mode of interest isolated in every free decay of a record, and the methods for it.
+
+Records may be of velocity, acceleration or displacement.
+"""
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
+from snrmjax.measure.decays.decay_record import even_record
 from snrmjax.measure.decays.isolated_decay import (
     MAX_INTERFERING,
     UNDETERMINED,
     IsolatedDecay,
     isolate_decay,
 )
+from snrmjax.measure.recordings.channels import channel_number
+from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.methods.records.recorded_test import RecordedDecay, RecordedTest
-from snrmjax.methods.records.recorded_velocity import recorded_velocity
 from snrmjax.methods.records.resonant_decay import decay_of_mode
 from snrmjax.methods.records.restoring_force import restoring_force
 from snrmjax.methods.records.ssm import curves_of_submanifold, fit_submanifold
@@ -21,6 +28,66 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
+
+_CORNER = 0.25  # of the motion's frequency: below it an integrated signal is drift
+_ORDER = 4  # at the motion's frequency the filter is then 1 within 2e-5
+_ENDS = 8.0  # cycles at both ends until it has settled
+_SPLINE = 5
+
+
+class RecordedVelocity(NamedTuple):
+    """A stretch of a record as velocity."""
+
+    time: Float[np.ndarray, " sample"]  # s
+    velocity: Float[np.ndarray, " sample"]  # m/s
+    start: int  # sample of the record at which it begins
+    notes: tuple[Fact, ...] = ()
+
+
+def recorded_velocity(
+    recording: TimeRecording,
+    name: str,
+    frequency: float,
+    part: tuple[int, int],
+) -> RecordedVelocity:
+    """The velocity of a motion over `part` of a record.
+
+    Arguments: `name` of a channel of velocity, acceleration or displacement; `frequency` of the
+    motion (rad/s); `part` in samples. Accelerations are integrated and displacements
+    differentiated by a spline of degree 5; drift of an integral, below a quarter of the frequency,
+    is removed by a zero-phase high-pass, whose ends of eight cycles are left out.
+    Returns a `RecordedVelocity`. Raises `ValueError` as `even_record` does (a clipped record, one
+    that is not finite).
+    """
+    quantity = recording.channels[channel_number(recording.channels, name)].quantity
+    start, stop = part
+    values = recording.values([name], start, stop)[0]
+    time, signal = even_record(recording.time(start, stop), values - values.mean())
+    notes: tuple[Fact, ...] = ()
+    cycle = max(1, int(np.ceil(HERTZ * recording.sampling_rate / frequency)))
+    if quantity != "velocity":
+        from scipy.interpolate import make_interp_spline
+
+        curve = make_interp_spline(time, signal, k=_SPLINE)
+        change = curve.derivative() if quantity == "displacement" else curve.antiderivative()
+        signal = np.asarray(change(time))
+        notes = (Fact("velocity_by_spline", quantity=quantity),)
+    if quantity == "acceleration":
+        from scipy.signal import butter, sosfiltfilt
+
+        ends = int(_ENDS * cycle)
+        if len(signal) < 4 * ends:
+            raise InputError(
+                f"an acceleration needs {4 * _ENDS:g} cycles to be integrated, but the record has "
+                f"{len(signal) / cycle:.3g}."
+            )
+        sections = butter(
+            _ORDER, _CORNER * frequency, "highpass", fs=HERTZ * recording.sampling_rate,
+            output="sos",
+        )  # fmt: skip
+        signal = sosfiltfilt(sections, signal)[ends:-ends]
+        time, start = time[ends:-ends], start + ends
+    return RecordedVelocity(time, signal, start, notes)
 
 
 def recorded_decays(test: RecordedTest, modes: LinearModes) -> tuple[RecordedDecay, ...]:
@@ -91,7 +158,7 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
     velocity = np.asarray(result.velocity)
     reference = decay_of_mode(decay)
     inside = (
-        reference.found
+        reference.has_result
         & (reference.velocity >= np.nanmin(velocity))
         & (reference.velocity <= np.nanmax(velocity))
     )
@@ -109,7 +176,9 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
         std = std * np.maximum(1.0, growth * decay.noise_std / manifold.slow_std)
         here, here_std = (
             np.interp(
-                np.asarray(reference.velocity)[inside], velocity[result.found], one[result.found]
+                np.asarray(reference.velocity)[inside],
+                velocity[result.has_result],
+                one[result.has_result],
             )
             for one in (value, std)
         )
@@ -121,16 +190,16 @@ def ssm_of_mode(decay: IsolatedDecay) -> MethodResult:
 def _curves_at(decay: IsolatedDecay, velocity: np.ndarray) -> list[list[np.ndarray]]:
     """Frequency and damping of `decay_of_mode` with their 1σ, at some amplitudes."""
     read = decay_of_mode(decay)
-    known, at = np.log(np.asarray(read.velocity)[read.found]), np.log(velocity)
+    known, at = np.log(np.asarray(read.velocity)[read.has_result]), np.log(velocity)
     return [
-        [np.interp(at, known, np.asarray(getattr(read, f"{name}{end}"))[read.found])
+        [np.interp(at, known, np.asarray(getattr(read, f"{name}{end}"))[read.has_result])
          for end in ("", "_std")]
         for name in ("natural_frequency", "damping_ratio")
     ]  # fmt: skip
 
 
 def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
-    omega = np.asarray(result.natural_frequency)[result.found]
+    omega = np.asarray(result.natural_frequency)[result.has_result]
     low, high = decay.band
     if omega.size and (omega.min() < low or omega.max() > high):
         raise InputError(
@@ -139,7 +208,8 @@ def _require_mode(result: MethodResult, decay: IsolatedDecay) -> None:
             "method follows another motion."
         )
     ratio, std = (
-        np.asarray(one)[result.found] for one in (result.damping_ratio, result.damping_ratio_std)
+        np.asarray(one)[result.has_result]
+        for one in (result.damping_ratio, result.damping_ratio_std)
     )
     if ratio.size and np.nanmedian(std / ratio) > UNDETERMINED:
         raise InputError(

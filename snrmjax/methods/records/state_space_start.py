@@ -181,15 +181,12 @@ def subspace_poles(
     values: Complex[np.ndarray, " frequency"],
     weight: Float[np.ndarray, " frequency"],
     states: int,
-    *,
-    rows: int = 10,
 ) -> Complex[np.ndarray, " state"]:
     """Eigenvalues of A, with G(z) = C (z I − A)⁻¹ B + D near the given values.
 
-    Arguments: `z` = e^{iΩ/rate}; `weight` multiplies each line's equations; `rows` of the
-    extended observability matrix.
+    Arguments: `z` = e^{iΩ/rate}; `weight` multiplies each line's equations.
     """
-    count = max(rows, states + 2)
+    count = max(10, states + 2)  # rows of the extended observability matrix
     powers = z ** np.arange(count)[:, None] * weight
     stacked = [_real(powers), _real(powers * values)]
     _, triangle = np.linalg.qr(np.concatenate(stacked).T)

@@ -32,7 +32,7 @@ def concerto(data: SteadyStates, modes: LinearModes) -> MethodResult:
     Returns a `MethodResult`; damping ratio is η/2, velocity is ω̃ times the displacement.
     1σ from the stated errors of both states, to first order; it grows towards the peak, where the
     two states coincide. Levels without a pair are `ONE_SIDE`, those of controlled displacement
-    `AMPLITUDE_HELD`.
+    `AMPLITUDE_CONTROLLED`.
     Raises `ValueError` where the data have neither forces nor drive voltages, or no phases.
     Validity: one mode, hysteretic damping (η is constant between the two frequencies), the
     displacement monotonic in frequency on each side.
@@ -45,7 +45,7 @@ def concerto(data: SteadyStates, modes: LinearModes) -> MethodResult:
 def _pairs(level: int, states: SensorStates) -> list[MethodPoint]:
     """The points of one level, one for each state with a partner."""
     if displacement_spread(states) <= CONTROLLED:
-        return [MethodPoint(MethodStatus.AMPLITUDE_HELD, level)]
+        return [MethodPoint(MethodStatus.AMPLITUDE_CONTROLLED, level)]
     amplitude = np.abs(states.displacement)
     below, above = (_rising(states, side) for side in (states.phase >= 0, states.phase < 0))
     points = []

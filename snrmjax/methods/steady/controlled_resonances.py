@@ -90,7 +90,7 @@ def control_based_continuation(
     motions, omega = [], laboratory.frequency
     for amplitude in positive("amplitudes", amplitudes):
         motions.append(bench.resonance(omega, float(amplitude)))
-        omega = motions[-1].frequency if motions[-1].held else omega
+        omega = motions[-1].frequency if motions[-1].on_target else omega
     per_force = drive_point(laboratory.structure.modes)
 
     def point(level: int, motion: ControlledMotion) -> MethodPoint:
@@ -115,10 +115,10 @@ def _points(
 ) -> list[MethodPoint]:
     """Points of locked motions; their 1σ includes the error of the velocity along the curve."""
     points = [
-        point(level, motion) if motion.held else MethodPoint(MethodStatus.NOT_LOCKED, level)
+        point(level, motion) if motion.on_target else MethodPoint(MethodStatus.NOT_LOCKED, level)
         for level, motion in enumerate(motions, 1)
     ]
-    locked = [k for k, motion in enumerate(motions) if motion.held]
+    locked = [k for k, motion in enumerate(motions) if motion.on_target]
     at = np.log([points[k].velocity for k in locked])
     order = np.argsort(at)
     if len(locked) < 2 or not np.all(np.diff(at[order]) > _SAME_VELOCITY):

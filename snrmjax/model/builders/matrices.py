@@ -96,7 +96,7 @@ def from_matrices(
     check_names(names, size)
     made = checked_effects(effects)
     forces = [effect for effect in made if isinstance(effect, AbstractForce)]
-    attachments = dict.fromkeys(b for e in forces for b in e.rows if b is not None)
+    attachments = dict.fromkeys(b for e in forces for b in e.influence_vectors if b is not None)
     influence = [_column(names, b, "an effect") for b in attachments]
     load = _load(m, names, force, base)
     squared, shapes, rigid = _modes(m, k, n_modes)
@@ -142,7 +142,7 @@ def from_matrices(
         mode_of_interest=mode_of_interest,
         rigid_body=RigidBodyModes(rigid[with_sensor], (load @ rigid).real),
         std=LinearModesStd(damping_ratio=ratio_std),
-        beside=OptionalModalData(
+        optional=OptionalModalData(
             other,
             coupling,
             -participation.imag if np.any(participation.imag) else None,

@@ -116,7 +116,7 @@ def slipped_position(
 class AbstractSliders(AbstractHysteresis):
     """Friction by parallel sliders; the states are their positions in kg^1/2 m."""
 
-    held_in_steps: ClassVar[bool] = True
+    constant_in_steps: ClassVar[bool] = True
 
     @abstractmethod
     def sliders(self) -> Sliders:

@@ -167,7 +167,7 @@ class FrictionContact(AbstractHysteresis):
     kind: ClassVar[str] = "friction_contact"
     description: ClassVar[str] = "Dry friction with variable normal force and separation."
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.NEITHER, Argument.HISTORY)
-    held_in_steps: ClassVar[bool] = True
+    constant_in_steps: ClassVar[bool] = True
     stiffness: Scalar = parameter("1/s²", "tangential stiffness", rules=(POSITIVE,))
     normal_stiffness: Scalar = parameter("1/s²", "normal stiffness", rules=(NOT_NEGATIVE,))
     friction: Scalar = parameter("1", "coefficient of friction", rules=(NOT_NEGATIVE,))
@@ -184,7 +184,7 @@ class FrictionContact(AbstractHysteresis):
             )
 
     @property
-    def rows(self) -> tuple[InfluenceVector | None, ...]:
+    def influence_vectors(self) -> tuple[InfluenceVector | None, ...]:
         return self.at, self.normal_at
 
     def stuck_stiffness(self) -> Float[Array, " attachment"]:

@@ -19,8 +19,7 @@ from snrmjax.identify.pointwise.prediction import (
     PredictedResponse,
     Resonance,
 )
-from snrmjax.measure.indicators import appropriation_of
-from snrmjax.measure.signals import force_velocity_loop
+from snrmjax.measure.signals import appropriation_of, force_velocity_loop
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.rules import InputError

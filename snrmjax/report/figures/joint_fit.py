@@ -109,7 +109,7 @@ def fitted_curves_figure(
                 marks(axes, own, y, style, "single states")
                 kept += [*y]
         if len(series) == 1 and np.any(one.fit.noise.level_std[2:] > 0):
-            wide = sample_fit(one.fit, of_a_new_level=True)
+            wide = sample_fit(one.fit, include_level_variance=True)
             x = wide.amplitude(shown) / unit.size
             style = {"band": "95 % band of a further level", "strength": 0.5, "linestyle": "none"}
             for axes, y, error in zip((natural, damping), *wide.curves(), strict=True):

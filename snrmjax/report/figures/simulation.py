@@ -403,14 +403,14 @@ def points_figure(
     x: np.ndarray | Sequence[int],
     y: np.ndarray,
     title: str,
-    below: str,
-    beside: str,
+    abscissa: str,
+    ordinate: str,
     *,
     limits: Sequence[float] = (),
 ) -> Figure:
     """Points, with dashed `limits`.
 
-    Arguments: `title` and what the axes `below` and `beside` are. Returns the figure. Raises
+    Arguments: `title` and what the axes `abscissa` and `ordinate` are. Returns the figure. Raises
     `ValueError` without a finite value.
     """
     if not np.isfinite(y).any():
@@ -419,5 +419,5 @@ def points_figure(
     axes.plot(x, y, **DOT)
     for limit in limits:
         axes.axhline(limit, color=BACKGROUND, linestyle="--")
-    name_axes(axes, title, below, beside)
+    name_axes(axes, title, abscissa, ordinate)
     return figure

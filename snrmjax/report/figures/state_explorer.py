@@ -13,7 +13,7 @@ from snrmjax.identify.inference.identification import Identification
 from snrmjax.measure.states import SteadyStates
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
-from snrmjax.pipelines.folded_records import FoldedRecord
+from snrmjax.pipelines.whole_test import FoldedRecord
 from snrmjax.report.figures.live import (
     legend_at_right,
     live_figures,
@@ -37,15 +37,12 @@ def state_explorer(
     data: SteadyStates,
     found: Identification | None = None,
     records: Sequence[FoldedRecord | None] = (),
-    *,
-    sensor: int | None = None,
 ) -> LiveFigures:
     """Live figures of a test.
 
     Arguments: `found` adds natural frequency and damping of every state; `records`, one a state
     (None where there is none), adds the raw record of the tapped state, initially that of
-    the largest velocity; `sensor` is the column of `data` to draw, by default the reference
-    sensor of `found` or the first.
+    the largest velocity. The sensor is the reference sensor of `found`, or the first.
     Raises `ValueError` where Bokeh is missing or `records` are not as many as the states.
     """
     require_bokeh()
@@ -54,9 +51,7 @@ def state_explorer(
 
     if len(records) not in (0, data.n_states):
         raise InputError(f"`records` must be one a state, {data.n_states}, but are {len(records)}.")
-    at = sensor if sensor is not None else 0
-    if sensor is None and found is not None:
-        at = data.sensors.index(found.points.sensor)
+    at = 0 if found is None else data.sensors.index(found.points.sensor)
     columns, speed, load = _columns(data, at)
     if found is not None:
         points = found.points

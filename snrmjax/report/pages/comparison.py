@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.tables import write_table
-from snrmjax.methods.comparison import METHODS, Comparison
-from snrmjax.methods.record_comparison import RECORD_METHODS
+from snrmjax.methods.comparison import METHODS, RECORD_METHODS, Comparison
 from snrmjax.methods.result import MethodResult, MethodStatus
 from snrmjax.numerics.units import HERTZ
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, number, write_report
@@ -107,11 +106,11 @@ def _done(found: Comparison) -> list[tuple[str, str]]:
 def methods_figure(results: tuple[MethodResult, ...]) -> Figure:
     """Natural frequency and damping of every method against velocity."""
     figure, grid = panels(COLUMN, 5.6, 2, 1)
-    every = np.concatenate([np.asarray(result.velocity)[result.found] for result in results])
+    every = np.concatenate([np.asarray(result.velocity)[result.has_result] for result in results])
     unit = unit_for(every, "m/s")
     values: list[list[np.ndarray]] = [[], []]
     for k, one in enumerate(results):
-        at = one.found
+        at = one.has_result
         if not at.any():
             continue
         x = np.asarray(one.velocity)[at] / unit.size
@@ -178,7 +177,7 @@ def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
     banded = [
         result.method
         for result in results
-        if np.isfinite(np.asarray(result.natural_frequency_std)[result.found]).any()
+        if np.isfinite(np.asarray(result.natural_frequency_std)[result.has_result]).any()
     ]
     noise, polynomial = (
         " and ".join(_NAMES[name] for name in banded if name in kind)
@@ -209,8 +208,8 @@ def _summary(found: Comparison) -> dict:
         "bands": notes_on_bands(results),
         "methods": {
             result.method: {
-                "points": int(result.found.sum()),
-                "failed": int((~result.found).sum()),
+                "points": int(result.has_result.sum()),
+                "failed": int((~result.has_result).sum()),
                 "states": result.n_states,
                 "record_s": result.test_seconds,
                 **dict(zip(_AWAY, near.get(result.method, (None, None)), strict=True)),
@@ -233,14 +232,14 @@ def _table(found: Comparison) -> ReportTable:
             continue
         away = near.get(name)
         gap = ("", "") if away is None else (number(away[0], 2), f"{number(100 * away[1], 2)} %")
-        kinds = {MethodStatus(int(k)) for k in np.asarray(one.status)[~one.found]}
+        kinds = {MethodStatus(int(k)) for k in np.asarray(one.status)[~one.has_result]}
         why = "; ".join(kind.message for kind in sorted(kinds))
         used = str(one.n_states)
         if np.isfinite(one.test_seconds):
             used = f"{number(one.test_seconds, 3)} s"
-        counts = (used, str(int(one.found.sum())))
+        counts = (used, str(int(one.has_result.sum())))
         rows.append(
-            (_NAMES[name], *counts, *gap, f"{int((~one.found).sum())}: {why}" if why else "")
+            (_NAMES[name], *counts, *gap, f"{int((~one.has_result).sum())}: {why}" if why else "")
         )
     own = found.reference
     of = "" if own is None else f" of the {_NAMES[own.method]}"

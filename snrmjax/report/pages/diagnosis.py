@@ -33,8 +33,13 @@ from snrmjax.report.figures.diagnosis import (
     found_effects,
     misfit_figure,
 )
-from snrmjax.report.figures.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
-from snrmjax.report.figures.parts import PARTS_CAPTION, parts_figure
+from snrmjax.report.figures.parts import (
+    LAW_CAPTION,
+    PARTS_CAPTION,
+    drawn_laws_figure,
+    law_tables,
+    parts_figure,
+)
 from snrmjax.report.html import (
     PROGRAM,
     Report,
@@ -108,7 +113,7 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
     summary = written.summarise_diagnosis(diagnosis, predicted)
     if found.where is not None:
         summary |= written.summarise_localisation(found.where)
-        if found.is_placed:
+        if found.is_located:
             summary |= written.placed_answer(found.where)
     write_summary(folder / "diagnosis.json", summary)
     if diagnosis.parts:
@@ -133,7 +138,7 @@ def write(folder: Path, found: DiagnosedTest, *, title: str = "", data: str = ""
 def _location_section(where: Localisation) -> Section:
     """Attachment points with probabilities, and the law that best explains the sensors at each."""
     rows = []
-    for place in where.places:
+    for place in where.candidates:
         law = "" if place.law is None else effect_name(place.law.kind)
         rows.append((place.name, in_words(place.probability), law))
     table = ReportTable(("location", "probability", "law there"), rows, "Where the force acts")
@@ -143,8 +148,8 @@ def _location_section(where: Localisation) -> Section:
 def answer_in_words(found: DiagnosedTest) -> str:
     """The verdict with the effects of the answer, or of the best attempt."""
     diagnosis, where = found.diagnosis, found.where
-    if found.is_placed and where is not None and where.places[0].law is not None:
-        return f"{found.verdict} ({where.places[0].law.kind} at {where.places[0].name})"
+    if found.is_located and where is not None and where.candidates[0].law is not None:
+        return f"{found.verdict} ({where.candidates[0].law.kind} at {where.candidates[0].name})"
     effects = ", ".join(diagnosis.effects)
     if effects:
         effects = f" ({effects})" if diagnosis.verdict.is_answer else f"; best attempt: {effects}"
@@ -160,10 +165,10 @@ def headline(found: DiagnosedTest) -> list[str]:
         *([f"{_attempt(diagnosis, 'identified')} (± 1σ): {values}"] if values else []),
         f"probability: {diagnosis.most_probable()}",
     ]
-    if found.is_placed and found.where is not None:
+    if found.is_located and found.where is not None:
         lines = [
             str(found.where.answer),
-            f"identified (± 1σ): {_located_values(found.where.places[0])}",
+            f"identified (± 1σ): {_located_values(found.where.candidates[0])}",
         ]
     elif diagnosis.decide_by:
         lines.append(f"what would decide: {diagnosis.decide_by}")
@@ -199,9 +204,9 @@ def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure
     data = diagnosis.data
     sensor = data.sensors[diagnosis.force_misfit.sensor]
     _, before, after = simulated.predicted
-    if simulated.held is None:
+    if simulated.required_forces is None:
         return comparison_figure(before, after, data, sensor=sensor)
-    return controlled_velocity_figure(*simulated.held, data, sensor)
+    return controlled_velocity_figure(*simulated.required_forces, data, sensor)
 
 
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
@@ -287,7 +292,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
         top = max(predicted, key=lambda one: one.force)
         pairs = [("measured", top.measured), ("model as given", top.before)]
         pairs.append(("completed model", top.completed))
-        if top.held_out:
+        if top.withheld:
             pairs.append((f"predicted without level {top.level}", top.after))
         unit = velocity_unit(one for _, one in pairs)
         text = "; ".join(f"{name}: {resonance_in_words(one, unit)}" for name, one in pairs)
@@ -337,7 +342,7 @@ def _comparison_section(
             "fold where the branch ends. Where no phase was measured: the state with the largest "
             "ratio of velocity to force."
         )
-        if any(row.held_out for row in predicted):
+        if any(row.withheld for row in predicted):
             header.append("predicted without this level")
             caption += " The last column is from models fitted without that level."
         tables.append(

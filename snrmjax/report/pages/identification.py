@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from snrmjax.identify.inference.identification import Identification
 from snrmjax.identify.joint.joint_fit import NoiseEstimate
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.identify.pointwise.inversion import PointStatus
 from snrmjax.identify.pointwise.prediction import (
     PredictedResponse,
     Resonance,

@@ -13,8 +13,7 @@ from snrmjax.io.files import write_summary
 from snrmjax.io.results import load_named
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.units import HERTZ
-from snrmjax.pipelines.identify import FitDetails, IdentifiedTest
-from snrmjax.pipelines.predictions import Prediction
+from snrmjax.pipelines.identify import FitDetails, IdentifiedTest, Prediction
 from snrmjax.report.figures import identification as plot
 from snrmjax.report.figures.simulation import normal_mode_figure
 from snrmjax.report.html import Report, ReportFigure, Section, with_error, write_report

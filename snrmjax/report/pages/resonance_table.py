@@ -12,12 +12,12 @@ def resonance_rows(rows: Sequence[LevelResponse], force_unit: str = "N") -> list
     """The rows of the table of resonances, all velocities in one unit."""
     each = [(row.measured, row.before, row.completed, row.after) for row in rows]
     unit = velocity_unit(one for four in each for one in four)
-    some_withheld = any(row.held_out for row in rows)
+    some_withheld = any(row.withheld for row in rows)
     table = []
     for row, (*fitted, withheld) in zip(rows, each, strict=True):
         texts = [resonance_in_words(one, unit) for one in fitted]
         if some_withheld:
-            texts.append(resonance_in_words(withheld, unit) if row.held_out else "–")
+            texts.append(resonance_in_words(withheld, unit) if row.withheld else "–")
         table.append((str(row.level), _unbroken(with_unit(row.force, force_unit)), *texts))
     return table
 

@@ -136,7 +136,7 @@ SENTENCES: dict[str, Wording] = {
             + (
                 f"{samples:.4g} samples. Only whole samples are shifted."
                 if abs(samples - round(samples)) > 0.01
-                else "and share less than half of their time."
+                else "and overlap for less than half of their time."
             )
         )
     ),

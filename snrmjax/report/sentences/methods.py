@@ -8,10 +8,6 @@ def _record_sorted(name: str, kind: str, why: Fact, states: Fact | None) -> str:
     return f"{name}: {kind} ({why}{'' if states is None else f'; {states}'})"
 
 
-def _drive_stops(channel: str, n: int) -> str:
-    return f"{channel} stops for {n} interval{'s' if n > 1 else ''} of 12 cycles"
-
-
 def _state_space_fitted(
     n_monomials: int, misfit: float, linear_misfit: float, validation: float | None
 ) -> str:
@@ -64,7 +60,7 @@ SENTENCES: dict[str, Wording] = {
     "data_left_out": "left out: {why}",
     "steps_settled": "{n} of {n_steps} settled",
     "states_read": "{n:#state} read",
-    "drive_stops": _drive_stops,
+    "drive_stops": "{channel} stops for {n:#interval} of 12 cycles",
     "motion_decays_under_noise": "the motion decays while {channel} is noise",
     "drive_is_no_tone": "{channel} is not one tone: it covers {low_hz:.4g} to {high_hz:.4g} Hz",
     "motion_falls_undriven": "no force or drive acts, and the motion decays",

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from snrmjax.numerics.status import Status
 from snrmjax.report.sentences import Wording, enumerated, of_levels
 
 _NOT_LOCATED = {
@@ -19,14 +18,6 @@ def _not_located(force: float, unit: str, kinds: Sequence[str]) -> str:
     counts = Counter(_NOT_LOCATED.get(kind, f"a {kind.replace('_', ' ')}") for kind in kinds)
     each = [text if n == 1 else f"{text} ({n} times)" for text, n in counts.items()]
     return f"force {force:g} {unit}: detected but missing in response.csv: {'; '.join(each)}."
-
-
-def _ended(force: float, unit: str, status: Status) -> str:
-    return f"force {force:g} {unit}: a curve {status.message}."
-
-
-def _not_followed(to_hz: float, ends_hz: float, status: Status) -> str:
-    return f"the mode ends at {ends_hz:.5g} Hz instead of {to_hz:.5g} Hz: it {status.message}."
 
 
 def _equilibria(
@@ -172,7 +163,7 @@ SENTENCES: dict[str, Wording] = {
         "the mode is unstable at {n} points from {from_hz:.5g} to {to_hz:.5g} Hz: free motions "
         "depart from it there"
     ),
-    "mode_not_followed": _not_followed,
+    "mode_not_followed": "the mode ends at {ends_hz:.5g} Hz instead of {to_hz:.5g} Hz: it {status.message}.",
     "no_stable_response": _no_stable_response,
     "element_idle": _element_idle,
     "held_by_friction": _stuck,
@@ -181,7 +172,7 @@ SENTENCES: dict[str, Wording] = {
         "peak there: as stated in the model, or from rounded entries of its damping matrix (for a "
         "fine mesh state `damping_ratio`, or a multiple of the stiffness)."
     ),
-    "curve_ended": _ended,
+    "curve_ended": "force {force:g} {unit}: a curve {status.message}.",
     "curve_events_not_located": _not_located,
     "stability_not_computed": (
         "force {force:g} {unit}: the stability of {n} points could not be computed; response.csv "

@@ -14,16 +14,23 @@ from snrmjax.report.sentences.study import readable
 from snrmjax.report.study.study_figures import (
     bands_figure,
     counts_figure,
+    display,
     distributions_figure,
     failures_figure,
     main_effects_figure,
+    of_members,
     short_name,
+    span_in_words,
 )
-from snrmjax.report.study.words import display, of_members, span_in_words
 from snrmjax.report.style import printed
 from snrmjax.study.analysis.bands import SAMPLED, curve_bands
-from snrmjax.study.analysis.digest import StudyDigest, digest, effects_frame, ranked_effects
-from snrmjax.study.analysis.failures import ranked_by_failure
+from snrmjax.study.analysis.digest import (
+    StudyDigest,
+    digest,
+    effects_frame,
+    ranked_by_failure,
+    ranked_effects,
+)
 from snrmjax.study.analysis.outputs import ScalarSummary, summary_frame
 from snrmjax.study.computations.base import COMPLETE, FORCE, MEMBER
 from snrmjax.study.uncertainty.sensitivity import MainEffect

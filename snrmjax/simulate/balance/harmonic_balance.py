@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from snrmjax.model.averaging import AveragedForce
 from snrmjax.model.effect_base import AbstractHysteresis, AbstractNonsmooth
+from snrmjax.model.effect_shape import AveragedForce
 from snrmjax.model.elements import ForceGroup, elements_of
 from snrmjax.model.modes import phasor_of_load
 from snrmjax.model.moving_base import newtons

@@ -68,7 +68,7 @@ class StepControl(eqx.Module):
     corner_miss: Number = (
         2.0  # the same for steps below `corner_step`, where no cubic predicts the curve
     )
-    largest_turn: Number = 3.0  # between neighbouring tangents, over `angle`
+    largest_rotation: Number = 3.0  # between neighbouring tangents, over `angle`
     # A harmonic that changes sign within a step has jumped from one flank of a lightly damped
     # resonance to the other: it changes by twice its norm, on a smooth curve by less than one.
     largest_change: Number = 0.9  # of one harmonic in a step, over its norm
@@ -83,7 +83,7 @@ class StepControl(eqx.Module):
 
     def is_near(self, step: Array, miss: Array, rotation: Array) -> Bool[Array, ""]:
         """Whether a point is near enough to its prediction to be the next one of the curve."""
-        smooth = (miss < self.largest_miss * step) & (rotation < self.largest_turn * self.angle)
+        smooth = (miss < self.largest_miss * step) & (rotation < self.largest_rotation * self.angle)
         corner = (
             (step < self.corner_step) & (rotation < 0.5 * jnp.pi) & (miss < self.corner_miss * step)
         )

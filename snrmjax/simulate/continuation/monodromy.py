@@ -48,7 +48,7 @@ def monodromy(
     variables of friction laws. NaN where more steps would be needed than any sensible motion
     needs, and for contacts with variable normal force.
     """
-    if any(len(force.rows) > 1 for force in model.forces):
+    if any(len(force.influence_vectors) > 1 for force in model.forces):
         # Their slip events cannot be located between samples here.
         unknown = (frequency.shape[0], 2 * model.n_modes, 2 * model.n_modes)
         return jnp.full(unknown, jnp.nan)

@@ -83,7 +83,7 @@ def friction_hold(model: Structure, from_frequency: float, to_frequency: float) 
 def _forces(model: Structure, kind: Any) -> Iterator[tuple[Any, Float[np.ndarray, " mode"]]]:
     """The forces of a kind that act on one displacement x = r·q, and their influence vectors r."""
     for effect in model.effects:
-        if isinstance(effect, kind) and len(effect.rows) == 1:
+        if isinstance(effect, kind) and len(effect.influence_vectors) == 1:
             elements = elements_of([effect], model.modes)
             own = elements.own is not None
             yield effect, model.own_mode if own else np.asarray(elements.influence)[0]
@@ -94,5 +94,5 @@ def _over_a_period(x: Float[np.ndarray, "point coefficient"]) -> Float[np.ndarra
 
 
 def _name(effect: AbstractForce) -> str:
-    (row,) = effect.rows
+    (row,) = effect.influence_vectors
     return effect.kind.replace("_", " ") + ("" if row is None else f" at {influence_text(row)}")

@@ -35,7 +35,7 @@ def internal_variables_at_rest(
 def _acts_on(model: Structure, effect: AbstractHysteresis, q: Float[Array, " mode"]) -> StateAt:
     """The displacement (of q̇ the velocity) of an element; several for several influence vectors."""
     local = elements_of([effect], model.modes).displacement(q)
-    return local if len(effect.rows) > 1 else local[0]
+    return local if len(effect.influence_vectors) > 1 else local[0]
 
 
 def inner_force(
@@ -56,7 +56,7 @@ def inner_force(
         x, rate = _acts_on(model, effect, q), _acts_on(model, effect, v)
         values = effect.state_force(x, rate, states)
         inner = inner + elements_of([effect], model.modes).on_modes(jnp.atleast_1d(values))
-        constant = effect.held_in_steps
+        constant = effect.constant_in_steps
         rates.append(jnp.zeros_like(states) if constant else effect.state_rate(x, rate, states))
     return inner, tuple(rates)
 

@@ -115,7 +115,7 @@ class PhaseSweep(NamedTuple):
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N
     velocity: Complex[np.ndarray, " state"]  # m/s, relative to the force
-    held: Bool[np.ndarray, " state"]
+    on_target: Bool[np.ndarray, " state"]
     test_seconds: float
 
 
@@ -155,12 +155,12 @@ def phase_sweep(
         record_cycles=record_cycles,
         seed=seed,
     )
-    held = np.array([motion.held for motion in motions])
-    force = np.where(held, [motion.force for motion in motions], np.nan)
-    velocity = np.where(held, [motion.velocity for motion in motions], np.nan)
-    frequency = np.where(held, [motion.frequency for motion in motions], np.nan)
+    on_target = np.array([motion.on_target for motion in motions])
+    force = np.where(on_target, [motion.force for motion in motions], np.nan)
+    velocity = np.where(on_target, [motion.velocity for motion in motions], np.nan)
+    frequency = np.where(on_target, [motion.frequency for motion in motions], np.nan)
     relative = velocity * np.conj(force) / np.abs(force)
-    return PhaseSweep(wanted, frequency, np.abs(force), relative, held, seconds)
+    return PhaseSweep(wanted, frequency, np.abs(force), relative, on_target, seconds)
 
 
 def locked_motions(

@@ -47,7 +47,7 @@ class DecayTest(NamedTuple):
 
     record: TestRecord  # from the moment the shaker is disconnected
     seconds: float  # duration of resonance and decay
-    resonance: ControlledMotion  # `held` if the loop had locked
+    resonance: ControlledMotion  # `on_target` if the loop had locked
 
 
 class Playback(AbstractController):

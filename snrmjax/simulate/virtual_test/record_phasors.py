@@ -20,10 +20,10 @@ _MOST_HARMONICS = 9  # removed from a record to estimate its noise
 class ControlledMotion(NamedTuple):
     """A motion under control: fundamentals over the recorded part and their errors, 1σ.
 
-    NaN if not available; without `held` the target was missed or the motion was not steady.
+    NaN if not available; without `on_target` the target was missed or the motion was not steady.
     """
 
-    held: bool
+    on_target: bool
     frequency: float  # rad/s
     frequency_std: float = np.nan  # rad/s; NaN where the frequency is prescribed
     force: complex = complex(np.nan)  # N

@@ -189,7 +189,7 @@ class FeedbackBench:
         ]
         scatter = np.sqrt(HANN) * scatter_of_ratio(force, velocity, angle)
         return ControlledMotion(
-            held=invasive < self.settings.invasive and unsteady < _STEADY,
+            on_target=invasive < self.settings.invasive and unsteady < _STEADY,
             frequency=frequency,
             force=complex(pushed[0]),
             velocity=complex(moved[0]),
@@ -201,7 +201,7 @@ class FeedbackBench:
     def resonance(self, omega: float, amplitude: float) -> ControlledMotion:
         """The motion in phase with its force at one amplitude, by the secant method.
 
-        Starts at the frequency `omega` (rad/s); not `held` if the phase stays beyond 0.5°.
+        Starts at the frequency `omega` (rad/s); not `on_target` if the phase stays beyond 0.5°.
         """
         before: tuple[float, float] | None = None
         for _ in range(_MOST_STEPS):
@@ -217,7 +217,7 @@ class FeedbackBench:
                 step = secant if abs(secant) < 10 * abs(step) else step
             before = omega, float(error)
             omega += float(np.clip(step, -_LARGEST_STEP * omega, _LARGEST_STEP * omega))
-        return motion._replace(held=False)
+        return motion._replace(on_target=False)
 
 
 def _harmonics(signal: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -249,10 +249,10 @@ def s_curve(
     motions = [
         bench.motion(float(omega), float(value)) for value in positive("amplitudes", amplitudes)
     ]
-    held = np.array([motion.held for motion in motions])
+    on_target = np.array([motion.on_target for motion in motions])
     return SCurve(
-        np.where(held, np.abs([motion.velocity for motion in motions]), np.nan),
-        np.where(held, np.abs([motion.force for motion in motions]), np.nan),
+        np.where(on_target, np.abs([motion.velocity for motion in motions]), np.nan),
+        np.where(on_target, np.abs([motion.force for motion in motions]), np.nan),
         np.array([motion.invasive for motion in motions]),
         bench.seconds,
     )

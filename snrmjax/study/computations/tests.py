@@ -9,7 +9,7 @@ from jaxtyping import Float
 from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.verdict import answer_of
 from snrmjax.identify.inference.identification import Identification, identify_backbone
-from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.identify.pointwise.inversion import PointStatus
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes, reference_sensor
 from snrmjax.model.structures import Structure

@@ -19,9 +19,9 @@ from snrmjax.diagnose.kinds.registry import (
 )
 from snrmjax.diagnose.kinds.table import HYPOTHESES
 from snrmjax.diagnose.misfit.candidates import candidate
-from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effect_metadata import MotionScales
+from snrmjax.model.effect_shape import averaged_effect
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
 SCALES = MotionScales(

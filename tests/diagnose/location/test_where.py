@@ -9,6 +9,7 @@ from truths import two_modes
 from truths.chain_states import steady_states, structure
 
 import snrmjax as sj
+from snrmjax.diagnose.location.where import EVERYWHERE
 from snrmjax.diagnose.verdict import Verdict
 from snrmjax.io.diagnosis_results import placed_answer, summarise_localisation
 from snrmjax.pipelines.diagnose import DiagnosedTest
@@ -33,8 +34,8 @@ def test_sensors_locate_the_force_without_a_law(law):
     data, model = steady_states(INFLUENCE, law, sensors), structure(sensors)
     candidates = ("x1", "x2", "x3", "x4", "x2-x1", "x3-x2", "x4-x3")
     found = sj.diagnose.locate_force(data, model, candidates, laws=LAWS)
-    assert found.told
-    assert found.places[0].name == "x3-x2"
+    assert found.is_determined
+    assert found.candidates[0].name == "x3-x2"
     assert found.probability.sum() == pytest.approx(1.0, abs=1e-12)
     # The residual is noise: 18 states of 5 orders and 3 sensors, 1σ of the root about 0.04.
     assert 0.8 < found.misfit < 1.2
@@ -44,8 +45,8 @@ def test_one_sensor_locates_it_by_the_law():
     data, model = steady_states(INFLUENCE, hardening, ("x4",)), structure(("x4",))
     candidates = ("x1", "x3-x2", "x2", "x4", "x4-x3")
     found = sj.diagnose.locate_force(data, model, candidates, laws=LAWS)
-    assert found.places[0].name == "x3-x2"
-    law = found.places[0].law
+    assert found.candidates[0].name == "x3-x2"
+    law = found.candidates[0].law
     assert law.kind == "cubic_stiffness"
     (value,), (std,) = law.parameters.values(), law.std.values()
     assert abs(value - CUBIC) < 3.3 * std
@@ -65,15 +66,15 @@ def test_one_sensor_locates_it_by_the_law():
     ):
         assert DiagnosedTest(
             SimpleNamespace(verdict=verdict, effects=effects), model, None, found
-        ).is_placed
+        ).is_located
     same = SimpleNamespace(verdict=Verdict.NAMED, effects=("cubic_stiffness",))
-    assert not DiagnosedTest(same, model, where=found).is_placed
+    assert not DiagnosedTest(same, model, where=found).is_located
     by_mode = SimpleNamespace(verdict=Verdict.UNKNOWN, effects=())
     test = DiagnosedTest(by_mode, model, where=found)
     assert test.verdict == answer["verdict"] == Verdict.NAMED
     assert answer_in_words(test) == "named (cubic_stiffness at x3-x2)"
-    shared = found.places[0]._replace(laws={"cubic_stiffness": 0.6, "quintic_stiffness": 0.4})
-    shared = dataclasses.replace(found, places=(shared, *found.places[1:]))
+    shared = found.candidates[0]._replace(laws={"cubic_stiffness": 0.6, "quintic_stiffness": 0.4})
+    shared = dataclasses.replace(found, candidates=(shared, *found.candidates[1:]))
     test = DiagnosedTest(by_mode, model, where=shared)
     assert test.verdict == placed_answer(shared)["verdict"] == Verdict.AMBIGUOUS
     assert answer_in_words(test) == "ambiguous (cubic_stiffness at x3-x2)"
@@ -82,8 +83,8 @@ def test_one_sensor_locates_it_by_the_law():
 def test_a_force_on_the_mode_is_everywhere():
     data = two_modes.steady_states({(4, 0): 2e4}, noise=3e-3, seed=2)
     found = sj.diagnose.locate_force(data, two_modes.structure(), laws=LAWS)
-    assert found.places[0].name == sj.diagnose.EVERYWHERE
-    assert found.told
+    assert found.candidates[0].name == EVERYWHERE
+    assert found.is_determined
     assert not found.explains
 
 
@@ -93,7 +94,7 @@ def test_locations_behind_one_sensor_require_another():
     data, model = steady_states((0, 0, 0, 1.0), drag, sensors), structure(sensors)
     found = sj.diagnose.locate_force(data, model, ("x3", "x4", "x1"), laws=LAWS)
     assert set(found.name[:2]) == {"x3", "x4"}
-    assert found.settled_by in ("x3", "x4")
+    assert found.separating_sensor in ("x3", "x4")
 
 
 def test_what_cannot_be_located_is_refused():
@@ -125,8 +126,8 @@ def test_a_location_is_fitted_with_the_harmonics_of_its_element():
         **{"forces": (15.0, 30.0, 45.0), "span": (0.72, 0.84), "stored": (1,), "noise": 5e-4},
     )
     found = sj.diagnose.locate_force(data, structure(sensors), ("x4-x3", "x2", "x4"), laws=LAWS)
-    law = found.places[0].law
-    assert (found.places[0].name, law.kind) == ("x4-x3", "cubic_stiffness")
+    law = found.candidates[0].law
+    assert (found.candidates[0].name, law.kind) == ("x4-x3", "cubic_stiffness")
     assert found.explains
     assert law.parameters["coefficient"] == pytest.approx(3e9, rel=0.04)
 

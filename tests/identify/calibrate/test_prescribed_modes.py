@@ -17,7 +17,7 @@ NAMES = [f"potential.{key}" for key in KEYS]
 def test_coefficients_are_recovered(sensors):
     data = steady_states(TERMS, sensors=sensors)
     fit = sj.calibrate_model(
-        structure(KEYS, sensors), data, NAMES, held_modes=(0, 1), harmonic_order=5
+        structure(KEYS, sensors), data, NAMES, prescribed_modes=(0, 1), harmonic_order=5
     )
     # Both balances have five harmonics; the states are exact to what `fsolve` leaves.
     np.testing.assert_allclose(fit.values, list(TERMS.values()), rtol=1e-5)
@@ -29,7 +29,9 @@ def test_stated_errors_are_those_of_the_coefficients():
     for seed in range(6):
         # The second mode moves little more than its noise: errors in variables.
         data = steady_states(TERMS, noise=5e-3, seed=seed, forces=(0.5, 1.0))
-        fit = sj.calibrate_model(structure(KEYS), data, NAMES, held_modes=(0, 1), harmonic_order=5)
+        fit = sj.calibrate_model(
+            structure(KEYS), data, NAMES, prescribed_modes=(0, 1), harmonic_order=5
+        )
         standardised.append((fit.values - np.array(list(TERMS.values()))) / fit.std)
         # 14 states of 2 sensors and 4 orders: 1σ of the reduced χ² is 0.1.
         assert 0.7 < fit.reduced_chi_square < 1.4
@@ -41,4 +43,4 @@ def test_wrong_modes_are_refused():
     data, model = steady_states(TERMS), structure(KEYS)
     for wrong in ((0, 0), (2,)):
         with pytest.raises(ValueError, match="different modes from 0 to 1"):
-            sj.calibrate_model(model, data, NAMES, held_modes=wrong)
+            sj.calibrate_model(model, data, NAMES, prescribed_modes=wrong)

@@ -20,7 +20,7 @@ class ViscousSliding(sj.identify.OwnFamily):
 
     kind = "viscous_sliding"
     names = ("viscous", "friction")
-    numbers: ClassVar = {"speed": (0.05, 0.3)}
+    nonlinear_parameters: ClassVar = {"speed": (0.05, 0.3)}
 
     @classmethod
     def columns(cls, x, speed):

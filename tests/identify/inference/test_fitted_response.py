@@ -13,7 +13,7 @@ from truths.joint_fits import noisy_fit
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.inference.forced_motion import InitialPoint, solved_point
-from snrmjax.identify.prediction.new_level import ON_THE_CURVES
+from snrmjax.identify.prediction.new_level import WITHOUT_LEVEL_ERRORS
 from snrmjax.io.joint_results import write_next
 
 FORCE = 2.2  # N: folds are there
@@ -115,7 +115,7 @@ def test_folds_are_where_the_frequency_reverses(exact_fit):
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["resonance", "fold"])
 def test_slopes_of_points_are_central_differences(fit, kind):
-    curve = sj.identify.fitted_response(fit, FORCE, of=ON_THE_CURVES)[0]
+    curve = sj.identify.fitted_response(fit, FORCE, of=WITHOUT_LEVEL_ERRORS)[0]
     best = max(curve.resonances if kind == "resonance" else curve.folds, key=lambda p: p.velocity)
     start = InitialPoint(kind, best.velocity / best.frequency, best.frequency)
     slopes = solved_point(fit, FORCE, start).slopes[:2]
@@ -125,7 +125,7 @@ def test_slopes_of_points_are_central_differences(fit, kind):
         values = []
         for sign in (1, -1):
             there = moved(fit, vector + sign * step * np.eye(len(vector))[k])
-            one = sj.identify.fitted_response(there, FORCE, of=ON_THE_CURVES)[0]
+            one = sj.identify.fitted_response(there, FORCE, of=WITHOUT_LEVEL_ERRORS)[0]
             points = one.resonances if kind == "resonance" else one.folds
             near = max(points, key=lambda p: p.velocity)
             values.append([near.frequency, near.velocity])
@@ -161,7 +161,7 @@ def test_a_new_level_has_a_wider_band(fit):
     scattering = dataclasses.replace(fit, problem=problem)
     speeds = np.array([0.3, 0.8])
     plain = sj.identify.fitted_values(scattering, speeds)
-    wide = sj.identify.fitted_values(scattering, speeds, of_a_new_level=True)
+    wide = sj.identify.fitted_values(scattering, speeds, include_level_variance=True)
     extra = np.sqrt(wide.modal_damping_std**2 - plain.modal_damping_std**2)
     np.testing.assert_allclose(extra, 0.05 * np.asarray(plain.modal_damping), rtol=1e-9)
 

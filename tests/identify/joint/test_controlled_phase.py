@@ -60,7 +60,7 @@ def test_scatter_of_the_frequency_changes_neither_mass_nor_damping(scatter):
     """Up to a quarter of the half-power bandwidth, 4e-3."""
     model, data = at_resonance(scatter)
     fit = sj.fit_jointly(data, model)
-    assert fit.modes_found.participation == pytest.approx(model.modes.participation)
+    assert fit.identified_modes.participation == pytest.approx(model.modes.participation)
     x = np.geomspace(0.05, 0.95, 20)
     speed = 0.064 * x
     squared, modal = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
@@ -86,7 +86,7 @@ def test_loosely_controlled_phases_change_neither_mass_nor_damping(scatter, spre
     """
     model, data = about_resonance(scatter, np.radians(spread), seed)
     fit = sj.fit_jointly(data, model)
-    assert fit.modes_found.participation == pytest.approx(model.modes.participation)
+    assert fit.identified_modes.participation == pytest.approx(model.modes.participation)
     x = np.geomspace(0.12, 0.95, 20)
     omega = 2 * np.pi * HZ * frequency_ratio(x)
     found = sj.identify.fitted_values(fit, 1e-4 * x * omega)

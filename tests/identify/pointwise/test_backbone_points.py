@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from snrmjax.identify.pointwise.backbone_points import identify_points
-from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.identify.pointwise.inversion import PointStatus
 from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import LinearModesStd, RigidBodyModes, linear_modes
 

@@ -15,11 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snrmjax.identify.pointwise.inversion import (
+    PointStatus,
+    SnrmPoints,
     closed_form,
     invert_amplitude_phase,
     invert_phasor,
 )
-from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
 from snrmjax.identify.pointwise.two_equations import CramersRule
 from snrmjax.model.modes import LinearModes, residual_velocity
 

@@ -69,7 +69,9 @@ def test_the_band_of_a_resonance_includes_level_errors(fit, kind, error):
     else:
         ends = [bisected(FORCE, **{error: sign * step}) for sign in (1, -1)]
         slope = (ends[0] - ends[1]) / (2 * step)
-    own = sj.identify.fitted_response(fit, FORCE, of=sj.identify.ON_THE_CURVES)[0].resonances[0]
+    own = sj.identify.fitted_response(fit, FORCE, of=sj.identify.WITHOUT_LEVEL_ERRORS)[
+        0
+    ].resonances[0]
     expected = np.hypot(0.02 * slope, [own.frequency_std, own.velocity_std])
     # Bisection to 1e-15 over a step of 1e-5.
     np.testing.assert_allclose([tip.frequency_std, tip.velocity_std], expected, rtol=1e-6)
@@ -180,7 +182,7 @@ def test_a_force_at_another_point_scales_the_participation():
     linear = sj.model.linear_modes(
         *([500.0, 900.0], [0.012, 0.01], [shape["a"]], shape["a"]),
         sensors=("a",),
-        beside=OptionalModalData({"b": shape["b"]}),
+        optional=OptionalModalData({"b": shape["b"]}),
     )
     velocity = own + forces * second_mode(omega, tested[1])
     data = stated(level, omega, forces, velocity, sensors=("a",))

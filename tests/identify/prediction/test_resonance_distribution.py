@@ -9,7 +9,7 @@ from truths.levels_with_errors import Level
 
 import snrmjax as sj
 from snrmjax.identify.pointwise.backbone import BackboneValues
-from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
+from snrmjax.identify.prediction.new_level import WITHOUT_LEVEL_ERRORS, NewLevel
 from snrmjax.identify.prediction.resonance_distribution import (
     QUANTILES,
     KnownCurves,
@@ -41,7 +41,7 @@ def curves(damping, errors=None, load=OMEGA * DELTA * 0.5):
     return KnownCurves(values, shape, load, np.zeros(1))
 
 
-def found(given, *, new=ON_THE_CURVES, **settings):
+def found(given, *, new=WITHOUT_LEVEL_ERRORS, **settings):
     """The distribution for these curves up to twice the largest amplitude."""
     return resonance_distribution(
         2.0, AMPLITUDE, given, new, no_other, **{"ratio": 2.0, **settings}

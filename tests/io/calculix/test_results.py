@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snrmjax.io.calculix.results import eigenvalues, first_error, last_energy, printed_tables
+from snrmjax.io.calculix.jobs import eigenvalues, first_error, last_energy, printed_tables
 
 FREQUENCIES = """
      E I G E N V A L U E   O U T P U T

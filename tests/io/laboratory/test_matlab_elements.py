@@ -10,7 +10,7 @@ import scipy.sparse
 from truths.import_runs import run_import
 
 from snrmjax.io.laboratory import read_laboratory_file
-from snrmjax.io.laboratory.arrays.matlab_elements import checked_variables
+from snrmjax.io.laboratory.arrays.matlab_files import checked_variables
 
 HERTZ = np.array([79.0, 79.5, 80.0])
 TEXT = struct.pack("<IIIIII", 6, 8, 4, 0, 5, 8)  # flags of a text, and the tag of its dimensions

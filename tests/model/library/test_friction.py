@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from snrmjax.model.averaging import averaged_effect
+from snrmjax.model.effect_shape import averaged_effect
 from snrmjax.model.effects import make_effect
 
 AMPLITUDE = np.array([0.5, 0.99, 1.01, 1.3, 2.0, 5.0, 50.0])

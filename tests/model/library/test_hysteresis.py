@@ -69,7 +69,7 @@ def contact(**changed):
 )
 def test_derivatives_are_those_of_differences(effect):
     x, v = map(jnp.asarray, path(TAU))
-    if len(effect.rows) == 2:
+    if len(effect.influence_vectors) == 2:
         x = jnp.stack([x, 0.3 * jnp.roll(x, 40)], axis=1)
         v = jnp.stack([v, v], axis=1)
     way = jnp.asarray(np.sin(3 * TAU)).reshape(-1, *[1] * (x.ndim - 1)) * jnp.ones_like(x)
@@ -114,8 +114,11 @@ def test_files_hold_both_places_of_a_contact(tmp_path):
     )
     sj.io.write_model(tmp_path / "m.toml", sj.model.structure(modes, effects=contact()))
     again = sj.read_model(tmp_path / "m.toml").effects[0]
-    assert again.rows == contact().rows
+    assert again.influence_vectors == contact().influence_vectors
     assert float(again.preload) == 3.0
     text = (tmp_path / "m.toml").read_text()
     (tmp_path / "m.toml").write_text(text.replace('normal_at = "y"', 'normal_between = ["y", "x"]'))
-    assert sj.read_model(tmp_path / "m.toml").effects[0].rows[1] == (("y", 1.0), ("x", -1.0))
+    assert sj.read_model(tmp_path / "m.toml").effects[0].influence_vectors[1] == (
+        ("y", 1.0),
+        ("x", -1.0),
+    )

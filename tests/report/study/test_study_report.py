@@ -11,15 +11,13 @@ from typer.testing import CliRunner
 
 from snrmjax.cli import app
 from snrmjax.numerics.facts import Fact
-from snrmjax.report.study.study_figures import main_effects_figure
+from snrmjax.report.study.study_figures import display_on_axis, main_effects_figure
 from snrmjax.report.study.study_report import (
     study_sentence,
     summary_table,
     write_study_report,
 )
-from snrmjax.report.study.words import display_on_axis
-from snrmjax.study.analysis.digest import digest
-from snrmjax.study.analysis.failures import failure_fraction, failures_of, ranked_by_failure
+from snrmjax.study.analysis.digest import digest, failure_fraction, failures_of, ranked_by_failure
 from snrmjax.study.analysis.outputs import Scalar, scalars, summarized
 
 NASTY = "<script>alert(1)</script>$x^2$"

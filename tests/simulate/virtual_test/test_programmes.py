@@ -52,7 +52,7 @@ def test_an_open_loop_jumps_down_later_than_up(laboratory):
 def test_phase_after_phase_a_loop_goes_around_the_fold(laboratory):
     phases, gains = np.radians([0.0, -40.0, -65.0, -80.0]), sj.simulate.LoopGains(80.0, 12.0)
     sweep = sj.simulate.phase_sweep(laboratory, 20.0, phases, gains=gains, settle_cycles=150)
-    assert sweep.held.all()
+    assert sweep.on_target.all()
     amplitude = np.abs(sweep.velocity) / sweep.frequency
     needed = impedance(amplitude, sweep.frequency) * sweep.velocity
     np.testing.assert_allclose(needed.real, sweep.force, rtol=3e-3)
@@ -66,7 +66,7 @@ def test_phase_after_phase_a_loop_goes_around_the_fold(laboratory):
 
 def test_a_decay_begins_on_the_resonance_and_is_free(laboratory):
     test = sj.simulate.decay_test(laboratory, 8.0, 3.0)
-    assert test.resonance.held
+    assert test.resonance.on_target
     assert np.abs(np.asarray(test.record.force)[1:]).max() == 0
     speed = np.abs(np.asarray(test.record.velocity))
     assert speed[:80].max() == pytest.approx(abs(test.resonance.velocity), rel=0.03)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from snrmjax.io.laboratory.arrays.value_tree import Numbers
 from snrmjax.io.laboratory.names import label_of, role_of
-from snrmjax.io.laboratory.physical_units import unit_meaning
+from snrmjax.io.laboratory.physical_units import meaning_or_none
 from snrmjax.numerics.rules import InputError
 from snrmjax.numerics.units import HERTZ
 
@@ -90,8 +90,7 @@ def is_mark(name: str, array: Numbers) -> bool:
 
 def in_hertz(unit: str) -> float:
     """Factor from a unit to Hz; 1 for a unit of another quantity."""
-    try:
-        meaning = unit_meaning(unit)
-    except ValueError:
+    meaning = meaning_or_none(unit)
+    if meaning is None or meaning.dimension != "frequency":
         return 1.0
-    return meaning.factor / HERTZ if meaning.dimension == "frequency" else 1.0
+    return meaning.factor / HERTZ

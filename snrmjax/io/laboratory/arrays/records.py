@@ -12,9 +12,8 @@ from snrmjax.io.laboratory.arrays.value_tree import (
     in_memory,
 )
 from snrmjax.io.laboratory.names import label_of, role_of
-from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference, unit_meaning
-from snrmjax.io.laboratory.printed_times import rate_of_printed_times
-from snrmjax.io.laboratory.uneven_times import odd_step, resampled
+from snrmjax.io.laboratory.physical_units import channel_meaning, level_reference, meaning_or_none
+from snrmjax.io.laboratory.printed_times import odd_step, rate_of_printed_times, resampled
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
 from snrmjax.numerics.facts import Fact
@@ -246,9 +245,8 @@ def _even_axis(key: str, array: Numbers) -> _Axis | str:
 
 def _unit_factor(key: str, array: Numbers, dimension: str) -> float:
     """Factor to s or Hz from the unit stated by the file or the name; 1 without one."""
-    try:
-        meaning = unit_meaning(array.unit or label_of(key).unit)
-    except ValueError:
+    meaning = meaning_or_none(array.unit or label_of(key).unit)
+    if meaning is None:
         return 1.0
     factor = meaning.factor / HERTZ if dimension == "frequency" else meaning.factor
     return factor if meaning.dimension == dimension else 1.0

@@ -76,7 +76,7 @@ def read_data_sets(path: Path) -> DataSets:
         try:
             with damaged_if_it_fails(file, where):
                 function = source.read_sets(k)
-        except ValueError:
+        except InputError:
             if number != 151:
                 raise
             # No numbers depend on the header.

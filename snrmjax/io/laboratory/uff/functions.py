@@ -8,16 +8,18 @@ import numpy as np
 
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.physical_units import is_per_force
-from snrmjax.io.laboratory.uff.abscissa import (
+from snrmjax.io.laboratory.printed_times import odd_step, resampled
+from snrmjax.io.laboratory.uff.axis_units import (
     EvenAbscissa,
+    UnitSystem,
     abscissa,
+    axis_unit,
     even_abscissa,
     in_si,
     other_abscissa,
+    unit_system,
 )
-from snrmjax.io.laboratory.uff.axis_units import UnitSystem, axis_unit, unit_system
 from snrmjax.io.laboratory.uff.data_sets import direction_of, read_data_sets, stated
-from snrmjax.io.laboratory.uneven_times import odd_step, resampled
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
 from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
