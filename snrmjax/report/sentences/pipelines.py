@@ -163,7 +163,9 @@ SENTENCES: dict[str, Wording] = {
         "the mode is unstable at {n} points from {from_hz:.5g} to {to_hz:.5g} Hz: free motions "
         "depart from it there"
     ),
-    "mode_not_followed": "the mode ends at {ends_hz:.5g} Hz instead of {to_hz:.5g} Hz: it {status.message}.",
+    "mode_not_followed": (
+        "the mode ends at {ends_hz:.5g} Hz instead of {to_hz:.5g} Hz: it {status.message}."
+    ),
     "no_stable_response": _no_stable_response,
     "element_idle": _element_idle,
     "held_by_friction": _stuck,
