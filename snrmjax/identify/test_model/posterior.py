@@ -19,7 +19,7 @@ posterior mode, and the evidence integrates over them by Laplace's approximation
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -220,7 +220,7 @@ def fit_test(
     """
     if len(states.level) < 2:
         raise InputError(f"a test needs at least two states, not {len(states.level)}.")
-    settings = {
+    settings: dict[str, Any] = {
         "discrepancy": discrepancy,
         "power_likelihood": power_likelihood,
         "average_roughness": average_roughness,
