@@ -64,26 +64,30 @@ def add_branches(
     branches are added. No more are sought when there are 16 curves.
     """
     for curve in curves:  # and those that are added on the way
-        new = _from_branch_points(balances, member, curve, known, ends, steps)
+        new = from_branch_points(balances, member, curve, known, ends, steps)
         if not new or len(curves) >= _MOST_CURVES:
             continue
         own = taken(balances, np.full(len(new), member))
         found = assembled(own, new, steps, branch=Branch.BRANCH_POINT)
-        curves.extend(_named(branch, ends) for branch in found if np.any(branch.is_stable))
+        curves.extend(with_named_ends(one, ends) for one in found if np.any(one.is_stable))
         known.extend(branch.points for branch in new)
 
 
-def _named(branch: ResponseCurve, ends: Float[np.ndarray, " end"]) -> ResponseCurve:
-    """A branch with its branch points named, where it begins or ends at one."""
+def with_named_ends(
+    branch: ResponseCurve,
+    ends: Float[np.ndarray, " end"],
+    kind: CurveEvent = CurveEvent.BRANCH_POINT,
+) -> ResponseCurve:
+    """A branch with its branch points named as `kind`, where it begins or ends at one."""
     events = list(branch.event)
     if not np.isclose(branch.frequency[0], ends).any():
-        events[0] = CurveEvent.BRANCH_POINT
+        events[0] = kind
     if branch.status == CurveStatus.BRANCH_POINT:
-        events[-1] = CurveEvent.BRANCH_POINT
+        events[-1] = kind
     return dataclasses.replace(branch, event=tuple(events))
 
 
-def _from_branch_points(
+def from_branch_points(
     balances: HarmonicBalance,
     member: int,
     curve: ResponseCurve,
@@ -133,7 +137,7 @@ def _crossing(balance: HarmonicBalance, curve: ResponseCurve, k: int) -> Crossin
     for fraction in _OFF:
         distance = fraction * float(np.linalg.norm(here[:-1]))
         trials = [
-            _corrected(balance, here + side * part * distance * away, away)
+            corrected(balance, here + side * part * distance * away, away)
             for part in (1.0, _CLOSE)
             for side in (-1.0, 1.0)
         ]
@@ -193,7 +197,8 @@ def _slope(
 
 
 @compiled
-def _corrected(
+def corrected(
     balance: HarmonicBalance, point: Float[Array, " unknown"], across: Float[Array, " unknown"]
 ) -> Trial:
+    """A scaled motion of the balance nearest to `point` in the hyperplane `across`."""
     return correct(balance.linearised, point, across, 1e-10, 30)
