@@ -168,6 +168,8 @@ class ResponseCurve(MotionCurve):
             k, r = np.unravel_index(np.argmax(height), height.shape)
             hertz = self.frequency / HERTZ
             events = _counted(filter(None, self.event))
+            if self.subharmonic > 1:
+                lines.append(f"repeats after {self.subharmonic} periods of the force")
             lines += [
                 f"frequency {hertz.min():.4g} to {hertz.max():.4g} Hz",
                 f"velocity fundamental up to {height[k, r]:.4g} m/s at"

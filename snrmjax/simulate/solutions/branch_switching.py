@@ -28,6 +28,7 @@ from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, 
 _MOST_CURVES = 16  # of one member; branches of branches end there
 _OFF = (0.1, 0.03)  # distances from a branch point at which the other curve is sought, relative
 _CLOSE = 0.02  # of that distance: where the branches are cut, the frequency differs by its square
+_SAME = 1e-5  # relative difference in frequency below which two branch points are one
 _KNOWN = 0.3  # of that distance: nearer to a known curve a motion is on it
 
 
@@ -84,6 +85,11 @@ def with_named_ends(
         events[0] = kind
     if branch.status == CurveStatus.BRANCH_POINT:
         events[-1] = kind
+    # Next to its end a branch is stable or not by rounding alone.
+    for end, beside in ((0, 1), (-1, -2)):
+        same = np.isclose(branch.frequency[end], branch.frequency[beside], rtol=_SAME)
+        if same and events[end] == kind and events[beside] == CurveEvent.BRANCH_POINT:
+            events[beside] = CurveEvent.NONE
     return dataclasses.replace(branch, event=tuple(events))
 
 
