@@ -44,10 +44,11 @@ def write_response(
     """Write simulated responses: frequency, velocity at one sensor, stability and events.
 
     `stable` is 1 where a motion is known to be stable and else 0; where stability was not
-    computed, `event` contains "stability_not_computed", and on subharmonic branches
-    "subharmonic_3", 3 being the number of periods of the force: the fundamental is then that of a
-    third of its frequency. Several sensors have further columns of their fundamentals. For base excitation the velocities are those recorded by the sensors, and
-    `base_acceleration_m_s2` replaces `force_n`.
+    computed, `event` contains "stability_not_computed". On branches of motions that repeat after
+    three periods of the force it contains "subharmonic_3", and the fundamental is that of a third
+    of the frequency. Several sensors have further columns of their fundamentals. For base
+    excitation the velocities are those recorded by the sensors, and `base_acceleration_m_s2`
+    replaces `force_n`.
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` when there is no such sensor or the file cannot be written.

@@ -86,10 +86,10 @@ def with_named_ends(
     if branch.status == CurveStatus.BRANCH_POINT:
         events[-1] = kind
     # Next to its end a branch is stable or not by rounding alone.
-    for end, beside in ((0, 1), (-1, -2)):
-        same = np.isclose(branch.frequency[end], branch.frequency[beside], rtol=_SAME)
-        if same and events[end] == kind and events[beside] == CurveEvent.BRANCH_POINT:
-            events[beside] = CurveEvent.NONE
+    for end, inner in ((0, 1), (-1, -2)):
+        same = np.isclose(branch.frequency[end], branch.frequency[inner], rtol=_SAME)
+        if same and events[end] == kind and events[inner] == CurveEvent.BRANCH_POINT:
+            events[inner] = CurveEvent.NONE
     return dataclasses.replace(branch, event=tuple(events))
 
 

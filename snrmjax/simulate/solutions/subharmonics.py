@@ -203,9 +203,7 @@ def _is_copy(
     )
 
 
-def _points(
-    balance: HarmonicBalance, curve: ResponseCurve
-) -> Float[np.ndarray, "point unknown"]:
+def _points(balance: HarmonicBalance, curve: ResponseCurve) -> Float[np.ndarray, "point unknown"]:
     """Scaled points of a curve in a balance over as many periods, or over a multiple of them."""
     n = balance.subharmonic
     rows = _repeated(curve.coefficients, n // curve.subharmonic).reshape(len(curve.frequency), -1)

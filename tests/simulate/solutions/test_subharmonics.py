@@ -38,7 +38,8 @@ def test_the_fold_of_an_isolated_third_is_that_of_an_independent_balance(third, 
     model, branch = third
     (k,) = branch.at_events("fold")
     motion, frequency = branch.point(k)
-    assert branch.subharmonic == 3 and frequency == branch.frequency[k] / 3
+    assert branch.subharmonic == 3
+    assert frequency == branch.frequency[k] / 3
     reference = numpy_balance(model, FORCE, 9, np.abs(motion).max(), driven=3)
     exact, speed = reference.event("fold", motion, frequency)
     # To the rounding of either.
@@ -101,7 +102,8 @@ def test_a_branch_leaves_where_a_multiplier_passes_minus_one(doubled, time_domai
         motion = state_of(*curve.point(k))
         exact = time_domain(model, force, curve.frequency[k]).multipliers(motion)
         assert np.abs(exact + 1).min() < 1e-5  # three harmonics leave out 8e-6 of the motion
-        assert branch.subharmonic == 2 and list(branch.at_events("period_doubling")) == [0]
+        assert branch.subharmonic == 2
+        assert list(branch.at_events("period_doubling")) == [0]
         assert not branch.at_events("branch_point").size
         np.testing.assert_allclose(branch.frequency[0], curve.frequency[k], rtol=1e-6)
         assert np.abs(branch.velocity[0, 1, 0]) < 1e-2 * np.abs(branch.velocity[0, 2, 0])
@@ -127,7 +129,8 @@ def test_branches_are_written_and_named(third, tmp_path):
     (note,) = (note for note in found.notes if note.kind == "subharmonic_searched")
     (limits,) = note["branches"]
     np.testing.assert_allclose(np.array(limits[:2]) * hertz, [branch.frequency.min(), 4.0])
-    assert limits[2] and "repeat after 3 periods of the force: 0.5" in str(note)
+    assert limits[2]
+    assert "repeat after 3 periods of the force: 0.5" in str(note)
     simulation.write(tmp_path, found)
     rows = (tmp_path / "response.csv").read_text(encoding="utf-8").splitlines()
     assert rows[0].split(",")[:3] == ["force_n", "point", "frequency_hz"]
@@ -150,7 +153,8 @@ def test_a_superharmonic_resonance_is_named(third):
     model, _ = third
     found = simulate_responses(model, [0.5], 0.25 / 2 / np.pi, 0.5 / 2 / np.pi, harmonics=3)
     (note,) = (note for note in found.notes if note.kind == "superharmonic_resonance")
-    assert note["harmonic"] == 3 and note["mode"] == 1
+    assert note["harmonic"] == 3
+    assert note["mode"] == 1
     assert 1.0 < 3 * note["frequency_hz"] * 2 * np.pi < 1.2
 
 
