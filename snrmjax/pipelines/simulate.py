@@ -314,17 +314,12 @@ def _superharmonic_resonances(model: Structure, curves: Sequence[ResponseCurve])
                 ratio, frequency = speed[k, h] / speed[k, 1], curve.frequency[k]
                 near = abs(h * frequency / natural[mode] - 1) < _RESONATES
                 if near and ratio > _SUPERHARMONIC:
-                    at = float(speed[k, h]), float(frequency), float(ratio)
-                    highest[h, mode] = max(at, highest.get((h, mode), at))
+                    here = float(speed[k, h]), float(frequency), float(ratio)
+                    highest[h, mode] = max(here, highest.get((h, mode), here))
     for (h, mode), (_, frequency, ratio) in highest.items():
         at = {"force": curves[0].force, "unit": curves[0].force_unit, "mode": mode + 1}
-        yield Fact(
-            "superharmonic_resonance",
-            **at,
-            harmonic=h,
-            frequency_hz=frequency / HERTZ,
-            ratio=ratio,
-        )
+        where = {"harmonic": h, "frequency_hz": frequency / HERTZ, "ratio": ratio}
+        yield Fact("superharmonic_resonance", **at, **where)
 
 
 def _notes_on_damping(model: Structure, ends: tuple[float, float]) -> Iterator[Fact]:

@@ -111,12 +111,13 @@ def forced_response(
     models = [simulated_structure(model)] * len(loads)
     settings = ResponseSettings(harmonic_order, n_samples, steps, stability)
     curves = _chunk_of_curves(models, loads, ends, settings, alone=len(loads) == 1)
-    found = []
+    found: list[ResponseCurve] = []
     for parts in curves:
         found += parts
         for order in np.atleast_1d(np.asarray(subharmonic, dtype=int)).tolist():
-            own = {"n_samples": n_samples, "stability": stability}
-            found += subharmonic_responses(models[0], parts, order, ends, steps, **own)
+            found += subharmonic_responses(
+                models[0], parts, order, ends, steps, n_samples=n_samples, stability=stability
+            )
     return found
 
 

@@ -68,17 +68,16 @@ def subharmonic_responses(
     balances = dataclasses.replace(
         balances, subharmonic=order, frequency_scale=balances.frequency_scale / order
     )
-    settings = {"n_samples": n_samples, "stability": stability}
-    found: list[ResponseCurve] = []
-    if order == 2:
-        found = _doubled(balances, known, ends / order, steps)
-    elif order % 2 == 0:
-        half = subharmonic_responses(model, known, order // 2, ends, steps, **settings)
-        found = _doubled(balances, half, ends / order, steps)
+    half: Sequence[ResponseCurve] = known if order == 2 else ()
+    if order > 2 and order % 2 == 0:
+        half = subharmonic_responses(
+            model, known, order // 2, ends, steps, n_samples=n_samples, stability=stability
+        )
+    found = _doubled(balances, half, ends / order, steps)
     starts = list(_starts(model, known, order, ends))
     if starts:
         scale = max(np.max(np.abs(coefficients)) for coefficients, _ in starts)
-        balances = dataclasses.replace(balances, displacement_scale=np.array([scale]))
+        balances = dataclasses.replace(balances, displacement_scale=jnp.array([scale]))
     traced = _isolated(balances, starts, found, ends / order, steps)
     return found + assembled(
         taken(balances, np.zeros(len(traced), dtype=int)),
@@ -99,7 +98,8 @@ def _doubled(
 
     In the balance with twice the period a period doubling is a branch point.
     """
-    balance, found = as_arrays(taken(balances, 0)), []
+    balance: HarmonicBalance = as_arrays(taken(balances, 0))
+    found: list[TracedCurve] = []
     known = [_points(balance, curve) for curve in curves]
     for curve in curves:
         at_doublings = dataclasses.replace(
@@ -161,12 +161,14 @@ def _isolated(
     steps: StepControl,
 ) -> list[TracedCurve]:
     """Curves through the subharmonic motions on which Newton's method converges from the starts."""
-    balance, curves = as_arrays(taken(balances, 0)), []
+    balance: HarmonicBalance = as_arrays(taken(balances, 0))
+    curves: list[TracedCurve] = []
     known = [_points(balance, curve) for curve in found]
     at_frequency = np.append(np.zeros(balance.size), 1.0)
     for coefficients, frequency in starts:
-        start = balance.point(jnp.asarray(coefficients), frequency / balance.subharmonic)
-        trial = corrected(balance, np.asarray(start), at_frequency)
+        own = jnp.asarray(frequency / balance.subharmonic)
+        start = np.asarray(balance.point(jnp.asarray(coefficients), own))
+        trial = corrected(balance, start, at_frequency)
         point = np.asarray(trial.point)
         if not trial.converged or not _is_subharmonic(balance, point):
             continue
