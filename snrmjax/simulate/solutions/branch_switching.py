@@ -100,8 +100,12 @@ def from_branch_points(
     known: Sequence[Float[np.ndarray, "point unknown"]],
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
+    *,
+    unstable_too: bool = False,
 ) -> list[TracedCurve]:
     """The branches of one member that leave `curve` at the branch points where it loses stability.
+
+    With `unstable_too` also those that leave it where it is unstable on both sides.
 
     At a branch point the Jacobian of R(x, λ) has two null vectors; the other curve leaves along
     the one that is orthogonal to the tangent of the known curve. It is traced through the branch
@@ -120,7 +124,8 @@ def from_branch_points(
     lower, upper = ends / float(balance.frequency_scale)
     curves: list[TracedCurve] = []
     for k, crossing in crossings.items():
-        if crossing is None or not np.any(curve.is_stable[k - 1 : k + 2]):
+        stable = unstable_too or bool(np.any(curve.is_stable[k - 1 : k + 2]))
+        if crossing is None or not stable:
             continue
         for start in crossing.off:
             near = _KNOWN * crossing.distance

@@ -94,7 +94,7 @@ def _doubled(
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
 ) -> list[ResponseCurve]:
-    """Branches of twice the period from period doublings where a curve gains or loses stability.
+    """Branches of twice the period from the period doublings of curves.
 
     In the balance with twice the period a period doubling is a branch point.
     """
@@ -111,7 +111,9 @@ def _doubled(
                 for event in curve.event
             ),
         )
-        for piece in from_branch_points(balances, 0, at_doublings, known, ends, steps):
+        for piece in from_branch_points(
+            balances, 0, at_doublings, known, ends, steps, unstable_too=True
+        ):
             middle = piece.points[len(piece.points) // 2]
             if not any(_is_copy(balance, middle, points) for points in known):
                 known.append(piece.points)
