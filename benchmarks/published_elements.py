@@ -306,6 +306,30 @@ def _von_karman_beam() -> Rows:
     yield "end of the torus", float(torus.frequency[-1]), 34.028
 
 
+def _subharmonic_of_a_beam() -> Rows:
+    mass, damping, stiffness, points = sj.model.beam(
+        *(1.0, 1.0, 2.0, 40), supports=("clamped", "pinned"), mass_damping=2e-3
+    )
+    model = sj.model.from_matrices(
+        *(mass, damping, stiffness, points),
+        **{"force": "w20", "n_modes": 6, "residuals": False},
+    )
+    # The force is along the second mode alone.
+    along = dataclasses.replace(model.modes, participation=jnp.asarray(np.eye(6)[1]))
+    model = _with_stretching(dataclasses.replace(model, modes=along), 1e-4, 2.0, 40)
+    second = model.modes.natural_frequency.item(1)
+    yield "natural frequency, rad/s", second, 12.4927
+    curves = sj.forced_response(
+        model, 40.0, 0.94 * second, 1.12 * second, harmonic_order=3, subharmonic=3
+    )
+    yield "fold, with the period of the force", float(_events(curves[:2], "fold")[0]), 12.607
+    folds = np.sort(_events(curves[2:], "fold"))
+    for fold, published in zip(folds, (11.805, 12.870, 13.008, 13.590, 13.653), strict=False):
+        yield "fold of order 1/3", float(fold), published
+    point = _nearest(_events(curves[2:], "neimark_sacker"), 13.216)
+    yield "Neimark-Sacker of order 1/3", point, 13.216
+
+
 def _isola_of_negative_damping() -> Rows:
     elements = (
         _element("cubic_stiffness", "w25", coefficient=6.0),
@@ -378,6 +402,7 @@ PROBLEMS: dict[str, Callable[[], Rows]] = {
     "18 Jenkins element, damped mode": _jenkins,
     "19 four-parameter Iwan joint": _iwan,
     "20 cantilever with a Jenkins element": _rubber_beam,
+    "27 clamped-pinned beam, subharmonic 1:3": _subharmonic_of_a_beam,
 }
 
 if __name__ == "__main__":

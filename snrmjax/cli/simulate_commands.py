@@ -47,6 +47,17 @@ def simulate(
             rich_help_panel=_MOTIONS,
         ),
     ] = False,
+    subharmonic: Annotated[
+        list[int] | None,
+        typer.Option(
+            help="Also search for motions that repeat after N periods of the force: from period "
+            "doublings (2, 4) and from the free oscillation of a mode near 1/N of the frequency. "
+            "Repeatable.",
+            metavar="N",
+            rich_help_panel=_MOTIONS,
+            show_default=False,
+        ),
+    ] = None,
     quasi_periodic: Annotated[
         bool,
         typer.Option(
@@ -102,6 +113,8 @@ def simulate(
     structure = read_model(model)
     if force is None and structure.modes.unbalance is None:
         raise InputError("`--force` must be given: the amplitude of the force in N.")
+    if any(order < 2 for order in subharmonic or []):
+        raise InputError("`--subharmonic` must be 2 or more: the number of periods of the force.")
     loads = force or [1.0]
     require_positive("--force", loads, structure.modes.force_unit)
     if follow and to is None:
@@ -116,6 +129,7 @@ def simulate(
             to_hz,
             harmonics=harmonics,
             isolated=isolated,
+            subharmonic=subharmonic or [],
             follow=[] if follow is None else [follow],
             parameter=parameter,
             to=to,

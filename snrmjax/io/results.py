@@ -44,9 +44,11 @@ def write_response(
     """Write simulated responses: frequency, velocity at one sensor, stability and events.
 
     `stable` is 1 where a motion is known to be stable and else 0; where stability was not
-    computed, `event` contains "stability_not_computed". Several sensors have further columns of
-    their fundamentals. For base excitation the velocities are those recorded by the sensors, and
-    `base_acceleration_m_s2` replaces `force_n`.
+    computed, `event` contains "stability_not_computed". On branches of motions that repeat after
+    three periods of the force it contains "subharmonic_3", and the fundamental is that of a third
+    of the frequency. Several sensors have further columns of their fundamentals. For base
+    excitation the velocities are those recorded by the sensors, and `base_acceleration_m_s2`
+    replaces `force_n`.
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` when there is no such sensor or the file cannot be written.
@@ -54,7 +56,7 @@ def write_response(
     r = _sensor_index(curves[0].sensors, sensor) if curves else 0
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
     recorded = [velocity_at_sensors(c, c.force) for c in curves]
-    velocity = np.concatenate([v[:, :, r] for v in recorded])
+    first = np.concatenate([v[:, 1, r] for v in recorded])
     named = {}
     if curves and len(curves[0].sensors) > 1:
         for index, name in enumerate(curves[0].sensors):
@@ -65,9 +67,9 @@ def write_response(
         "force_n": force,
         "point": _numbered(force),
         "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
-        "velocity_h1_re_m_s": velocity[:, 1].real,
-        "velocity_h1_im_m_s": velocity[:, 1].imag,
-        "velocity_peak_m_s": velocity_peaks(velocity),
+        "velocity_h1_re_m_s": first.real,
+        "velocity_h1_im_m_s": first.imag,
+        "velocity_peak_m_s": np.concatenate([velocity_peaks(v[:, :, r]) for v in recorded]),
         "stable": np.concatenate([c.is_stable for c in curves]),
         "event": [event for c in curves for event in _events(c)],
         **named,
@@ -142,10 +144,11 @@ def write_quasi_periodic(
 
 
 def _events(curve: ResponseCurve) -> list[str]:
-    """Events at every point, including unknown stability."""
+    """Events at every point, including unknown stability and the period of subharmonics."""
     unknown = curve.stability == int(Stability.NOT_COMPUTED)
+    period = "" if curve.subharmonic == 1 else f"subharmonic_{curve.subharmonic}"
     return [
-        "+".join(filter(None, [event, "stability_not_computed" if missing else ""]))
+        "+".join(filter(None, [event, period, "stability_not_computed" if missing else ""]))
         for event, missing in zip(curve.event, unknown.tolist(), strict=True)
     ]
 

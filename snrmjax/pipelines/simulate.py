@@ -40,6 +40,8 @@ _TRUNCATED = 0.02  # fraction of the velocity in truncated harmonics above which
 _KNOWN_DAMPING = 1e-5  # relative 1σ of a damping ratio above which a note is given
 _SAME_GAP = 1e-4  # relative frequency difference between a gap in stability and its event
 _SAME_EVENT = 1e-6  # relative frequency difference between an event and a curve of events
+_SUPERHARMONIC = 0.1  # least velocity of a harmonic that is reported to resonate, over the first
+_RESONATES = 0.25  # relative distance of its frequency from that of the mode: resonances shift
 
 
 class SimulatedResponses(NamedTuple):
@@ -68,6 +70,7 @@ def simulate_responses(
     *,
     harmonics: int = 9,
     isolated: bool = False,
+    subharmonic: Sequence[int] = (),
     follow: Sequence[EventKind] = (),
     parameter: str = FORCE,
     to: float | None = None,
@@ -77,7 +80,8 @@ def simulate_responses(
     """Responses to harmonic forces, around folds and with unstable parts.
 
     Arguments: `forces` in N, or multiples of the model's unbalance; highest balanced harmonic
-    `harmonics`; `isolated` also searches for curves that are not connected to the main one;
+    `harmonics`; `isolated` also searches for curves that are not connected to the main one,
+    `subharmonic` for motions that repeat after these numbers of periods of the force;
     `follow` kinds of events that are continued as the `parameter` goes from its value to `to`,
     and back after a turning point (see `follow_event`); `quasi_periodic` continues the motions
     with two frequencies from every Neimark-Sacker point; `progress` is called with each force when
@@ -102,7 +106,11 @@ def simulate_responses(
     notes = [*_notes_on_equilibria(model), *_notes_on_damping(model, ends)]
     for force in forces:
         progress(force)
-        main = forced_response(model, [force], *ends, harmonic_order=harmonics)
+        every = forced_response(
+            model, [force], *ends, harmonic_order=harmonics, subharmonic=subharmonic
+        )
+        main = [curve for curve in every if curve.subharmonic == 1]
+        notes += _superharmonic_resonances(model, main)
         of_force = [*main]
         if isolated:
             _log.info("searches for isolated responses at %g %s", force, model.modes.force_unit)
@@ -117,6 +125,10 @@ def simulate_responses(
                     n_failed=further.n_failed,
                 )
             )
+        for order in subharmonic:
+            longer = [curve for curve in every if curve.subharmonic == order]
+            notes.append(_subharmonics_found(force, model.modes.force_unit, order, longer))
+            of_force += longer
         notes += list(dict.fromkeys(n for curve in of_force for n in _notes_on_curve(curve, hold)))
         notes += _notes_on_force(model, of_force, ends, isolated)
         curves += of_force
@@ -129,15 +141,16 @@ def simulate_responses(
     if fraction > _TRUNCATED:
         notes.append(Fact("harmonics_left_out", harmonics=harmonics, fraction=fraction))
     events: list[EventCurve] = []
+    of_period = [curve for curve in curves if curve.subharmonic == 1]
     if to is not None:
         for kind in follow:
             _log.info("follows the events %s over %s", kind, parameter)
-            followed = _followed(model, curves, kind, parameter, to)
+            followed = _followed(model, of_period, kind, parameter, to)
             notes += [] if followed else [Fact("no_event_to_follow", event=kind)]
             events += followed
     tori: list[QuasiPeriodicBranch] = []
     if quasi_periodic:
-        tori, torus_notes = _tori(model, curves, ends)
+        tori, torus_notes = _tori(model, of_period, ends)
         notes += torus_notes
     return SimulatedResponses(tuple(curves), sensor, tuple(notes), tuple(events), tuple(tori))
 
@@ -279,6 +292,47 @@ def _notes_on_curve(curve: ResponseCurve, hold: Hold | None) -> Iterator[Fact]:
     unknown = int(np.sum(curve.stability == int(Stability.NOT_COMPUTED)))
     if unknown:
         yield Fact("stability_not_computed", **at, n=unknown)
+
+
+def _subharmonics_found(
+    force: float, unit: str, order: int, curves: Sequence[ResponseCurve]
+) -> Fact:
+    """The ranges of frequency of subharmonic branches, and whether any part of each is stable."""
+    branches = tuple(
+        (
+            *(float(edge(c.frequency)) / HERTZ for edge in (np.min, np.max)),
+            bool(np.any(c.is_stable)),
+        )
+        for c in curves
+    )
+    return Fact("subharmonic_searched", force=force, unit=unit, order=order, branches=branches)
+
+
+def _superharmonic_resonances(model: Structure, curves: Sequence[ResponseCurve]) -> Iterator[Fact]:
+    """Harmonics of the responses to one force that resonate with a mode, where they are highest.
+
+    The mode has the largest part of the harmonic at the first sensor, and a natural frequency
+    within a quarter of the harmonic's.
+    """
+    shape, natural = model.modes.mode_shape[0], np.asarray(model.modes.natural_frequency)
+    highest: dict[tuple[int, int], tuple[float, float, float]] = {}
+    for curve in curves:
+        speed = np.abs(curve.velocity[:, :, 0])
+        for h in range(2, speed.shape[1]):
+            rises = np.diff(speed[:, h]) > 0
+            peaks = 1 + np.flatnonzero(rises[:-1] & ~rises[1:])
+            parts = np.hypot(*np.moveaxis(curve.coefficients[peaks, 2 * h - 1 : 2 * h + 1], 1, 0))
+            modes = np.argmax(parts * np.abs(shape), axis=1)
+            for k, mode in zip(peaks.tolist(), modes.tolist(), strict=True):
+                ratio, frequency = speed[k, h] / speed[k, 1], curve.frequency[k]
+                near = abs(h * frequency / natural[mode] - 1) < _RESONATES
+                if near and ratio > _SUPERHARMONIC:
+                    here = float(speed[k, h]), float(frequency), float(ratio)
+                    highest[h, mode] = max(here, highest.get((h, mode), here))
+    for (h, mode), (_, frequency, ratio) in highest.items():
+        at = {"force": curves[0].force, "unit": curves[0].force_unit, "mode": mode + 1}
+        where = {"harmonic": h, "frequency_hz": frequency / HERTZ, "ratio": ratio}
+        yield Fact("superharmonic_resonance", **at, **where)
 
 
 def _notes_on_damping(model: Structure, ends: tuple[float, float]) -> Iterator[Fact]:

@@ -96,12 +96,13 @@ class NumpyBalance:
     """Harmonic balance by sampling, in NumPy, of a structure with a polynomial potential.
 
     Takes numbers from a model, none of its methods. Unknowns are the coefficients
-    (mean, cosine, sine, …) × mode over `scale`, flattened, and Ω over the first frequency.
+    (mean, cosine, sine, …) × mode over `scale`, flattened, and the motion's frequency over the
+    first natural one. The force acts on harmonic `driven` of the motion.
     """
 
-    def __init__(self, model, force, order, scale):
+    def __init__(self, model, force, order, scale, driven=1):
         modes = model.modes
-        self.n, self.order, self.scale = modes.n_modes, order, scale
+        self.n, self.order, self.scale, self.driven = modes.n_modes, order, scale, driven
         self.natural = np.asarray(modes.natural_frequency)
         self.viscous = 2 * np.asarray(modes.damping_ratio) * self.natural
         self.load = force * np.asarray(modes.participation)
@@ -138,7 +139,7 @@ class NumpyBalance:
         turned[1::2], turned[2::2] = h * x[2::2], -h * x[1::2]
         inertia = self.natural**2 - (self.orders[:, None] * omega) ** 2
         residual = inertia * x + omega * self.viscous * turned + force
-        residual[1] -= self.load
+        residual[2 * self.driven - 1] -= self.load
         jacobian = np.zeros((size, n, size, n))
         swap = np.zeros((size, size))
         for k in range(1, self.order + 1):

@@ -59,7 +59,8 @@ def simulated_response_figure(
     """Forced responses by harmonic balance: amplitude and phase of the velocity fundamental.
 
     Unstable parts are dashed, parts whose stability was not computed dash-dotted; triangles mark
-    peaks, squares folds, dots phase resonances.
+    peaks, squares folds, dots phase resonances. Subharmonic motions have their component at 1/n of
+    the frequency and no phase.
 
     Arguments: `sensor` by default the first of the curves.
     Returns the figure. Raises `ValueError` when no curve has a point or the sensor is missing.
@@ -68,18 +69,21 @@ def simulated_response_figure(
     if not drawn:
         raise InputError("there is no response to show: no curve has a point.")
     name = sensor or drawn[0].sensors[0]
-    forces = sorted({c.force for c in drawn})
-    shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
-    colours = dict(zip(forces, shades, strict=True))
+    kinds = sorted({(c.force, c.subharmonic) for c in drawn})
+    shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(kinds)))
+    colours = dict(zip(kinds, shades, strict=True))
     unit = unit_for(np.concatenate([velocity_of(c, name) for c in drawn]), "m/s")
     figure, speeds, phases = amplitude_and_phase(PAGE, 5.4, name, unit)
     markers = {"peak": "^", "fold": "s", "phase_resonance": "o"}
     for event in (None, *markers):
         for curve in drawn:
             v, x = velocity_of(curve, name), curve.frequency / HERTZ
-            for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
+            n, label = curve.subharmonic, with_unit(curve.force, curve.force_unit)
+            label += "" if n == 1 else f", component at 1/{n} of the frequency"
+            shown = (speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)
+            for axes, y in shown if n == 1 else shown[:1]:
                 if event is None:
-                    label, colour = with_unit(curve.force, curve.force_unit), colours[curve.force]
+                    colour = colours[curve.force, n]
                     response_line(axes, x, y, curve.stability, label, colour, LINE)
                     continue
                 at, style = curve.at_events(event), {**HOLLOW, "marker": markers[event]}

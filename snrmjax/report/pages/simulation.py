@@ -82,6 +82,8 @@ def _largest(curve: ResponseCurve, sensor: str) -> str:
     velocity = velocity_at_sensors(curve, curve.force)[:, 1]
     speed = np.abs(velocity[:, curve.sensors.index(sensor)])
     name = "" if curve.branch == Branch.MAIN else f" ({curve.branch})"
+    n = curve.subharmonic
+    of = "fundamental velocity" if n == 1 else f"velocity at 1/{n} of the frequency"
     load = "force" if curve.base is None else "base acceleration"
     load = load if curve.unbalance is None else "unbalance"
     load = f"{load} {curve.force:g} {curve.force_unit}{name}"
@@ -92,6 +94,6 @@ def _largest(curve: ResponseCurve, sensor: str) -> str:
     counts = {name: len(curve.at_events(kind)) for kind, name in _COUNTED.items()}
     events = ", ".join(number_of(n, name) for name, n in counts.items() if n or name == "fold")
     return (
-        f"{load}: fundamental velocity at {sensor} up to {speed[top]:.4g} m/s, at "
+        f"{load}: {of} at {sensor} up to {speed[top]:.4g} m/s, at "
         f"{curve.frequency[top] / HERTZ:.5g} Hz; {events}"
     )

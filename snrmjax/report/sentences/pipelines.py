@@ -39,6 +39,23 @@ def _load(force: float, drive: float | None, at: str | None = None, unit: str = 
     return newtons if at is None else f"{newtons} at {at}"
 
 
+def _subharmonics(
+    force: float, unit: str, order: int, branches: Sequence[tuple[float, float, bool]]
+) -> str:
+    start, period = f"force {force:g} {unit}", f"repeat after {order} periods of the force"
+    if not branches:
+        return (
+            f"{start}: no motions that {period} were found, from period doublings or from the free "
+            f"oscillation of a mode near 1/{order} of the frequency of the force; the search can "
+            "miss some."
+        )
+    listed = [
+        f"{low:.5g} to {high:.5g} Hz ({'partly stable' if stable else 'unstable'})"
+        for low, high, stable in branches
+    ]
+    return f"{start}: motions that {period}: {'; '.join(listed)}."
+
+
 def _no_stable_response(
     force: float,
     unit: str,
@@ -142,6 +159,11 @@ SENTENCES: dict[str, Wording] = {
     "no_joint_fit": ("curves are fitted to single points, as a joint fit was not possible: {why}"),
     "isolated_searched": (
         "{n} further branches found at {force:g} N, of {n_starts} starts ({n_failed} failed)"
+    ),
+    "subharmonic_searched": _subharmonics,
+    "superharmonic_resonance": (
+        "force {force:g} {unit}: superharmonic resonance at {frequency_hz:.5g} Hz: harmonic "
+        "{harmonic}, near mode {mode}, has up to {ratio:%.2g} of the fundamental velocity."
     ),
     "torus_not_followed": (
         "no quasi-periodic motions were followed from {frequency_hz:.5g} Hz at force {force:g}: "

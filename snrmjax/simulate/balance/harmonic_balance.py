@@ -37,6 +37,8 @@ class HarmonicBalance(eqx.Module):
     `x` holds the (coefficient, mode) displacements divided by `displacement_scale`, flattened;
     λ is the frequency divided by `frequency_scale`. Without a force and with `cosine_only` the
     solutions are the conservative normal modes (without damping and velocity-dependent forces).
+    With `subharmonic` = n the force acts on harmonic n of the motion, whose period is n times that
+    of the force: λ is then Ω/n divided by `frequency_scale`.
     """
 
     model: Structure
@@ -46,6 +48,7 @@ class HarmonicBalance(eqx.Module):
     harmonic_order: int = eqx.field(static=True)
     n_samples: int = eqx.field(static=True)
     cosine_only: bool = eqx.field(static=True, default=False)
+    subharmonic: int = eqx.field(static=True, default=1)  # periods of the force in the motion's
 
     @property
     def n_coefficients(self) -> int:
@@ -87,19 +90,20 @@ class HarmonicBalance(eqx.Module):
 
     def newtons(self, omega: Float[Array, ""]) -> Any:
         """The force (N) at a scaled frequency; see `newtons` of modes."""
-        return newtons(self.model.modes.unbalance, omega * self.frequency_scale, self.force)
+        drive = self.subharmonic * omega * self.frequency_scale
+        return newtons(self.model.modes.unbalance, drive, self.force)
 
     def load(self) -> Float[Array, " equation"]:
         """Scaled load of a force of one newton: the right-hand side for `newtons` = 1."""
         model = self.model
         if self.cosine_only:
             return jnp.zeros(self.size)
-        spectrum = model.load_orders()
-        orders = np.arange(min(len(spectrum), self.harmonic_order + 1))
-        cosines = np.eye(self.n_coefficients)[:, np.maximum(2 * orders - 1, 0)]
+        spectrum, n = model.load_orders(), self.subharmonic
+        orders = np.arange(min(len(spectrum), self.harmonic_order // n + 1))
+        cosines = np.eye(self.n_coefficients)[:, np.maximum(2 * n * orders - 1, 0)]
         load = jnp.outer(cosines @ spectrum[: len(orders)], model.modes.participation)
         if model.modes.participation_lag is not None:
-            sine = np.eye(self.n_coefficients)[2] * spectrum[1]
+            sine = np.eye(self.n_coefficients)[2 * n] * spectrum[1]
             load = load + jnp.outer(sine, model.modes.participation_lag)
         return load.reshape(-1) / (self.frequency_scale**2 * self.displacement_scale)
 

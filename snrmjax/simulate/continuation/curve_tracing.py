@@ -182,7 +182,8 @@ def trace_both_ways(
     if not len(up.points) or not len(back.points):
         whole = up if len(up.points) else back
         return whole._replace(n_solves=solves)
-    status = up.status if up.status != CurveStatus.UPPER_END else back.status
+    ends_there = down.status in (CurveStatus.LOWER_END, CurveStatus.UPPER_END)
+    status = up.status if ends_there or up.status != CurveStatus.UPPER_END else down.status
     return TracedCurve(
         np.concatenate([back.points[:-1], up.points]),
         np.concatenate([back.tangents[:-1], up.tangents]),

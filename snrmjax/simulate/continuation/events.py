@@ -181,6 +181,8 @@ def with_events(
         # A peak is a maximum: the slope falls through zero. A phase resonance has Re V > 0.
         change[:, 1] &= values[:-1, 1] > 0
         change[:, 2] &= (heights[:-1, 3] > 0) & (heights[1:, 3] > 0)
+        # The fundamental of a subharmonic motion has another frequency than the force.
+        change[:, 2] &= balances.subharmonic == 1
         where, what = np.nonzero(change)
         owner += [number] * len(where)
         kind += what.tolist()

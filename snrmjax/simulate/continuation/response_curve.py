@@ -52,6 +52,9 @@ class MotionCurve(AbstractResult):
     base: BaseMotion | None = eqx.field(static=True, default=None, kw_only=True)
     # With an unbalance U (kg m) and the force c U Ω², "forces" are the factors c.
     unbalance: float | None = eqx.field(static=True, default=None, kw_only=True)
+    # The motion repeats after this many periods of the force, and its harmonics h are those of
+    # Ω/subharmonic; `frequency` is that of the force.
+    subharmonic: int = eqx.field(static=True, default=1, kw_only=True)
 
     @property
     def force_unit(self) -> str:
@@ -63,8 +66,11 @@ class MotionCurve(AbstractResult):
         return {**super().variables(), **fundamental_variables(self.velocity)}
 
     def point(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients (kg^1/2 m) and frequency (rad/s) of a point: a start for other solvers."""
-        return self.coefficients[k], self.frequency[k]
+        """Coefficients (kg^1/2 m) and frequency (rad/s) of a point: a start for other solvers.
+
+        The frequency is that of the first harmonic, for subharmonic motions a fraction of Ω.
+        """
+        return self.coefficients[k], self.frequency[k] / self.subharmonic
 
 
 def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknown"]) -> dict:
@@ -73,9 +79,12 @@ def motions_of(balance: HarmonicBalance, points: Float[np.ndarray, "point unknow
     modes = balance.model.modes
     whole = with_sines(coefficients) if balance.cosine_only else coefficients
     velocity = velocity_phasors(whole, frequency, np.asarray(modes.mode_shape))
-    named = {"frequency": frequency, "coefficients": coefficients, "velocity": velocity}
-    unbalance = None if modes.unbalance is None else float(modes.unbalance)
-    return {**named, "sensors": modes.sensors, "base": modes.base, "unbalance": unbalance}
+    n, unbalance = balance.subharmonic, modes.unbalance
+    return {
+        **{"frequency": n * frequency, "coefficients": coefficients, "velocity": velocity},
+        **{"sensors": modes.sensors, "base": modes.base, "subharmonic": n},
+        "unbalance": None if unbalance is None else float(unbalance),
+    }
 
 
 def velocity_at_sensors(
@@ -88,7 +97,8 @@ def velocity_at_sensors(
     if curve.base is None:
         return curve.velocity
     velocity = curve.velocity.copy()
-    velocity[:, 1] += curve.base.own_velocity(curve.sensors, curve.frequency, force)
+    own = curve.base.own_velocity(curve.sensors, curve.frequency, force)
+    velocity[:, curve.subharmonic] += own
     return velocity
 
 
@@ -104,6 +114,8 @@ class Branch(StrEnum):
     BRANCH_POINT = "from a branch point"
     REST = "isolated, from a motion about rest"
     RANDOM_START = "isolated, from a random start"
+    PERIOD_DOUBLING = "from a period doubling"
+    FREE_OSCILLATION = "isolated, from the free oscillation of a mode"
 
 
 class ResponseCurve(MotionCurve):
@@ -156,6 +168,8 @@ class ResponseCurve(MotionCurve):
             k, r = np.unravel_index(np.argmax(height), height.shape)
             hertz = self.frequency / HERTZ
             events = _counted(filter(None, self.event))
+            if self.subharmonic > 1:
+                lines.append(f"repeats after {self.subharmonic} periods of the force")
             lines += [
                 f"frequency {hertz.min():.4g} to {hertz.max():.4g} Hz",
                 f"velocity fundamental up to {height[k, r]:.4g} m/s at"
@@ -199,6 +213,8 @@ def assembled(
 
     Arguments: `balances` stacked, one for every curve; `steps` with which they were traced.
     """
+    if not curves:
+        return []
     labelled = with_events(
         balances, [c._replace(events=(CurveEvent.NONE,) * len(c.points)) for c in curves], steps
     )

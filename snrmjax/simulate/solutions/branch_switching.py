@@ -28,6 +28,7 @@ from snrmjax.simulate.continuation.response_curve import Branch, ResponseCurve, 
 _MOST_CURVES = 16  # of one member; branches of branches end there
 _OFF = (0.1, 0.03)  # distances from a branch point at which the other curve is sought, relative
 _CLOSE = 0.02  # of that distance: where the branches are cut, the frequency differs by its square
+_SAME = 1e-5  # relative difference in frequency below which two branch points are one
 _KNOWN = 0.3  # of that distance: nearer to a known curve a motion is on it
 
 
@@ -64,34 +65,47 @@ def add_branches(
     branches are added. No more are sought when there are 16 curves.
     """
     for curve in curves:  # and those that are added on the way
-        new = _from_branch_points(balances, member, curve, known, ends, steps)
+        new = from_branch_points(balances, member, curve, known, ends, steps)
         if not new or len(curves) >= _MOST_CURVES:
             continue
         own = taken(balances, np.full(len(new), member))
         found = assembled(own, new, steps, branch=Branch.BRANCH_POINT)
-        curves.extend(_named(branch, ends) for branch in found if np.any(branch.is_stable))
+        curves.extend(with_named_ends(one, ends) for one in found if np.any(one.is_stable))
         known.extend(branch.points for branch in new)
 
 
-def _named(branch: ResponseCurve, ends: Float[np.ndarray, " end"]) -> ResponseCurve:
-    """A branch with its branch points named, where it begins or ends at one."""
+def with_named_ends(
+    branch: ResponseCurve,
+    ends: Float[np.ndarray, " end"],
+    kind: CurveEvent = CurveEvent.BRANCH_POINT,
+) -> ResponseCurve:
+    """A branch with its branch points named as `kind`, where it begins or ends at one."""
     events = list(branch.event)
     if not np.isclose(branch.frequency[0], ends).any():
-        events[0] = CurveEvent.BRANCH_POINT
+        events[0] = kind
     if branch.status == CurveStatus.BRANCH_POINT:
-        events[-1] = CurveEvent.BRANCH_POINT
+        events[-1] = kind
+    # Next to its end a branch is stable or not by rounding alone.
+    for end, inner in ((0, 1), (-1, -2)):
+        same = np.isclose(branch.frequency[end], branch.frequency[inner], rtol=_SAME)
+        if same and events[end] == kind and events[inner] == CurveEvent.BRANCH_POINT:
+            events[inner] = CurveEvent.NONE
     return dataclasses.replace(branch, event=tuple(events))
 
 
-def _from_branch_points(
+def from_branch_points(
     balances: HarmonicBalance,
     member: int,
     curve: ResponseCurve,
     known: Sequence[Float[np.ndarray, "point unknown"]],
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
+    *,
+    unstable_too: bool = False,
 ) -> list[TracedCurve]:
     """The branches of one member that leave `curve` at the branch points where it loses stability.
+
+    With `unstable_too` also those that leave it where it is unstable on both sides.
 
     At a branch point the Jacobian of R(x, λ) has two null vectors; the other curve leaves along
     the one that is orthogonal to the tangent of the known curve. It is traced through the branch
@@ -110,7 +124,8 @@ def _from_branch_points(
     lower, upper = ends / float(balance.frequency_scale)
     curves: list[TracedCurve] = []
     for k, crossing in crossings.items():
-        if crossing is None or not np.any(curve.is_stable[k - 1 : k + 2]):
+        stable = unstable_too or bool(np.any(curve.is_stable[k - 1 : k + 2]))
+        if crossing is None or not stable:
             continue
         for start in crossing.off:
             near = _KNOWN * crossing.distance
@@ -133,7 +148,7 @@ def _crossing(balance: HarmonicBalance, curve: ResponseCurve, k: int) -> Crossin
     for fraction in _OFF:
         distance = fraction * float(np.linalg.norm(here[:-1]))
         trials = [
-            _corrected(balance, here + side * part * distance * away, away)
+            corrected(balance, here + side * part * distance * away, away)
             for part in (1.0, _CLOSE)
             for side in (-1.0, 1.0)
         ]
@@ -193,7 +208,8 @@ def _slope(
 
 
 @compiled
-def _corrected(
+def corrected(
     balance: HarmonicBalance, point: Float[Array, " unknown"], across: Float[Array, " unknown"]
 ) -> Trial:
+    """A scaled motion of the balance nearest to `point` in the hyperplane `across`."""
     return correct(balance.linearised, point, across, 1e-10, 30)

@@ -29,6 +29,7 @@ from snrmjax.simulate.continuation.response_curve import (
 )
 from snrmjax.simulate.solutions.branch_switching import add_branches
 from snrmjax.simulate.solutions.from_rest import curves_from_rest, curves_where_sweeps_land
+from snrmjax.simulate.solutions.subharmonics import subharmonic_responses
 
 DEFAULT_STEPS = StepControl()
 _AT_FOLD = 1e-3  # relative distance in frequency of a fold and the last stable point
@@ -66,6 +67,7 @@ def forced_response(
     n_samples: int | None = None,
     steps: StepControl = DEFAULT_STEPS,
     stability: bool = True,
+    subharmonic: int | Sequence[int] = (),
 ) -> list[ResponseCurve]:
     """Trace the response to a cosine force through a frequency range, for one or more forces.
 
@@ -78,7 +80,8 @@ def forced_response(
     ("branch_point", "period_doubling", "neimark_sacker").
 
     Arguments: `forces` in N, one or many; frequencies in rad/s; `n_samples` over a period, by
-    default as many as the forces of the model need.
+    default as many as the forces of the model need; `subharmonic` n, or several, also searches for
+    motions that repeat after n periods of the force, for example 2 or 3.
     Returns one `ResponseCurve` for every force; its `status` is how it ended, and `not_located`
     names events that were detected but not located, and "branch" if one enters at `to_frequency`
     but has no start there. If the curve from the lower end does not reach the upper one, it is
@@ -87,9 +90,13 @@ def forced_response(
     `to_frequency`, the branch that enters there from the linear response is returned too, and so
     are those from further stable equilibria, from branch points at which a curve loses its
     stability, and where a sweep lands beyond a fold. For isolated branches see
-    `isolated_responses`.
-    Raises `ValueError` for a force that is not positive and for an empty or infinite frequency
-    range.
+    `isolated_responses`. Subharmonic motions follow as curves of their own with their
+    `subharmonic`: those that leave at period doublings (order 2, 4, …) and isolated ones from the
+    free oscillation of a mode at Ω/n, each without its copies that are delayed by periods of the
+    force. Their `frequency` is that of the force, their coefficients and velocities are those of
+    the harmonics of Ω/n, and their multipliers over n periods of the force. A search can miss one.
+    Raises `ValueError` for a force that is not positive, for an empty or infinite frequency
+    range and for a subharmonic below 2.
     Not differentiable: call it outside, and differentiate single motions of its curve:
     `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
     far.
@@ -104,7 +111,14 @@ def forced_response(
     models = [simulated_structure(model)] * len(loads)
     settings = ResponseSettings(harmonic_order, n_samples, steps, stability)
     curves = _chunk_of_curves(models, loads, ends, settings, alone=len(loads) == 1)
-    return [part for parts in curves for part in parts]
+    found: list[ResponseCurve] = []
+    for parts in curves:
+        found += parts
+        for order in np.atleast_1d(np.asarray(subharmonic, dtype=int)).tolist():
+            found += subharmonic_responses(
+                models[0], parts, order, ends, steps, n_samples=n_samples, stability=stability
+            )
+    return found
 
 
 class ResponseBatch(AbstractResult):

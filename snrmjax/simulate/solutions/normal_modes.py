@@ -140,7 +140,7 @@ def nonlinear_normal_mode(
     lower, upper = (omega / 10, to_frequency) if upward else (to_frequency, omega * 10)
     limit = 30.0 if largest_amplitude is None else largest_amplitude / scale
     ends = np.array([lower, upper, limit])
-    curve = on_host(_trace(balance, ends, steps))
+    curve = on_host(_trace(balance, np.array(j), ends, steps))
     cosines, frequency = balance.motions(curve.points)
     at_rest = np.sum(cosines, axis=1)  # q(0), where the velocity vanishes
     (energy,) = by_blocks(lambda rows: (_energy(model, rows),), 128, at_rest)
@@ -176,9 +176,28 @@ def conservative(model: Structure) -> Structure:
     return with_ratio(jnp.asarray(none / np.where(changes, none - whole, 1.0)))
 
 
+def free_oscillations(
+    model: Structure,
+    mode: int,
+    within: tuple[float, float],
+    harmonic_order: int,
+    steps: StepControl = DEFAULT_STEPS,
+) -> tuple[Float[np.ndarray, "point coefficient mode"], Float[np.ndarray, " point"]]:
+    """Motions of the normal mode that starts at a linear `mode`: coefficients and frequencies.
+
+    Arguments: `model` as simulated; the curve ends where it leaves the frequencies `within`
+    (rad/s), which contain the linear one. Returns kg^1/2 m and rad/s.
+    """
+    model = conservative(model)
+    scale = float(displacement_scale(model)[mode])
+    balance = harmonic_balance(model, 0.0, scale, harmonic_order=harmonic_order, cosine_only=True)
+    curve = on_host(_trace(balance, np.array(mode), np.array([*within, 30.0]), steps))
+    cosines, frequency = balance.motions(curve.points)
+    return np.asarray(with_sines(cosines)), frequency
+
+
 @compiled
-def _trace(balance: HarmonicBalance, ends: Array, steps: StepControl) -> Curve:
-    j = balance.model.modes.mode_of_interest
+def _trace(balance: HarmonicBalance, j: Int[Array, ""], ends: Array, steps: StepControl) -> Curve:
     modes, n = balance.model.modes, balance.model.n_modes
     # Start at a small amplitude, where Newton's method at fixed amplitude is well posed.
     size = balance.size + 1
