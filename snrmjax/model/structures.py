@@ -371,8 +371,7 @@ def _equilibria_by_newton(model: Structure, n_starts: int, seed: int) -> tuple[n
     scale = displacement_scale(model)
     rng = np.random.default_rng(seed)
     radius = 10.0 ** rng.uniform(-2, 1, (n_starts, 1))
-    direction = rng.normal(size=(n_starts, n))
-    starts = np.concatenate([np.zeros((1, n)), radius * direction * scale])
+    starts = np.vstack([np.zeros(n), radius * rng.normal(size=(n_starts, n)) * scale])
     ends, residual = (np.asarray(part) for part in _ends_of_newton(model, starts, np.max(scale)))
     good = np.all(np.isfinite(ends), axis=1) & (residual < 1e-9 * np.max(scale))
     return ends[good], 1e-6 * float(np.max(scale))
@@ -412,8 +411,7 @@ def displacement_scale(model: Structure) -> np.ndarray:
     """The displacement of each mode (kg^1/2 m) at which its nonlinear force becomes significant.
 
     There a term of the potential equals the linear force, or memoryless effects change it by a
-    tenth. It is the scale of searches and continuation; modes without terms of their own get the
-    median of the others.
+    tenth. A scale of searches; modes without terms of their own get the median of the others.
     """
     squared = np.asarray(linear_terms_of(model).stiffness)
     scale = np.full(model.n_modes, np.nan)
@@ -447,10 +445,5 @@ def _scale_of_elements(model: Structure, squared: np.ndarray) -> np.ndarray:
 @compiled
 def _along_modes(model: Structure, q: Float[Array, " point"]) -> Float[Array, "mode point"]:
     """Static modal forces of the memoryless elements on each mode that moves alone."""
-    elements = elements_of(model.memoryless, model.modes)
-
-    def along(influence: Array) -> Array:
-        x = q[:, None] * influence
-        return elements.force(x, jnp.zeros_like(x)) @ influence
-
-    return jax.vmap(along, 1)(elements.influence)
+    elements, q = elements_of(model.memoryless, model.modes), q[:, None]
+    return jax.vmap(lambda b: elements.force(q * b, 0 * q * b) @ b, 1)(elements.influence)
