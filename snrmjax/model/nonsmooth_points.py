@@ -198,7 +198,6 @@ def with_slip_corners(
     (slot,) = jnp.nonzero(kind.reshape(-1), size=_MAX_CROSSINGS, fill_value=0)
     interval, starts, known = slot // 2, slot % 2 == 0, jnp.arange(_MAX_CROSSINGS) < jnp.sum(kind)
     cubic = _cubic(q[(interval + np.arange(-1, 3)[:, None]) % n])
-    # A slider starts at a root of the displacement beyond slip, and stops at one of its slope.
     beyond = cubic[0] - z[interval] - side[interval] * slip
     # A slider starts at a root of the displacement beyond slip, and stops at one of its slope.
     start, stop = (beyond, *cubic[1:]), _derivative(cubic)
