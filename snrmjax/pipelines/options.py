@@ -195,7 +195,7 @@ class IdentifyOptions:
     )
     robust: bool = option(
         False,
-        "Give outlying states less weight.",
+        "Give outlying states less weight, also where noise without outliers is more probable.",
         panel=_JOINT,
         needs=_FIT,
         why_needed="belongs to a joint fit: add `--fit auto`",
