@@ -53,7 +53,7 @@ class LevelResponse(NamedTuple):
     measured: PhaseResonance
     before: PhaseResonance
     after: PhaseResonance
-    withheld: bool  # withheld: the model of `after` was not fitted to the level
+    withheld: bool  # the model of `after` was not fitted to the level
     complete: bool = True  # whether both responses were traced to the end of the range
     completed: PhaseResonance = _NOWHERE  # of the model fitted to all levels
 

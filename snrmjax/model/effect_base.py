@@ -81,6 +81,10 @@ class AbstractForce(AbstractEffect):
         default=None, static=True, kw_only=True, converter=checked_influence_vector
     )
 
+    def __init_subclass__(cls, **named: Any) -> None:
+        super().__init_subclass__(**named)
+        take_former(cls, {"rows": "influence_vectors"})
+
     @property
     def influence_vectors(self) -> tuple[InfluenceVector | None, ...]:
         """Its influence vectors: one, or two for contacts with tangential and normal motion.

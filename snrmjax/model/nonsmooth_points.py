@@ -105,8 +105,9 @@ def _turning_point(cubic: Cubic) -> Array:
     square = c2**2 - 3 * c1 * c3
     root = jnp.sqrt(jnp.where(square > 0, square, 1.0))
     below = jnp.where(c2 < 0, c2 - root, c2 + root)
-    turn = -c1 / jnp.where(below != 0, below, 1.0)
-    return jnp.where((square > 0) & (turn > 0) & (turn < 1), turn, -1.0)
+    turns = -c1 / jnp.where(below != 0, below, 1.0), -below / jnp.where(c3 != 0, 3 * c3, 1.0)
+    first, second = (jnp.where((square > 0) & (t > 0) & (t < 1), t, -1.0) for t in turns)
+    return jnp.where(first > 0, first, second)
 
 
 def _first_root(cubic: Cubic, second: Array, wanted: Array) -> Array:
@@ -171,7 +172,7 @@ def _corrected(
 
 
 def with_extremes(displacement: Samples) -> Float[Array, "time 2"]:
-    """The extreme value after the sample before, and the sample.
+    """For each sample: the extreme value in the interval before it, and the sample.
 
     By the cubic through the four samples around each interval; where it does not turn in between
     the sample stands twice.
@@ -190,13 +191,14 @@ def with_slip_corners(
     """Positions of a slider over a period, corrected so that sums over them are integrals.
 
     A slider at z starts to move where |q − z| reaches x_s, and stops where q turns: corners of z,
-    whose first and second derivatives jump by those of q, at most 16 in a period. See
-    `with_nonsmooth_points`.
+    whose first and second derivatives jump by those of q. With more than 16 in a period, as of four
+    and more oscillations, nothing is corrected. See `with_nonsmooth_points`.
     """
     n, (z, q, slip) = len(position), (position, displacement, slip_displacement)
     kind, side, fraction = _slip_corners(*jax.lax.stop_gradient((z, q, slip)))
     (slot,) = jnp.nonzero(kind.reshape(-1), size=_MAX_CROSSINGS, fill_value=0)
-    interval, starts, known = slot // 2, slot % 2 == 0, jnp.arange(_MAX_CROSSINGS) < jnp.sum(kind)
+    interval, starts, total = slot // 2, slot % 2 == 0, jnp.sum(kind)
+    known = (jnp.arange(_MAX_CROSSINGS) < total) & (total <= _MAX_CROSSINGS)
     cubic = _cubic(q[(interval + np.arange(-1, 3)[:, None]) % n])
     beyond = cubic[0] - z[interval] - side[interval] * slip
     # A slider starts at a root of the displacement beyond slip, and stops at one of its slope.
@@ -216,7 +218,7 @@ def _slip_corners(z: Samples, q: Samples, slip: Array) -> tuple[Array, Array, Ar
     extremum = jnp.where(turn > 0, _value(turn, cubic), second)
     rises = jnp.maximum(extremum, second) > z + slip
     side = jnp.where(rises, 1.0, jnp.where(jnp.minimum(extremum, second) < z - slip, -1.0, 0.0))
-    # At most rounding from slipping: it slips already.
+    # Within rounding of the slip limit: already slipping.
     slips = slip - jnp.abs(q - z) <= 1e-12 * (slip + jnp.abs(q))
     starts = (side != 0) & ~slips
     beyond: Cubic = side * (q - z) - slip, side * cubic[1], side * cubic[2], side * cubic[3]

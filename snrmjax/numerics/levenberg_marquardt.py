@@ -1,4 +1,4 @@
-"""Levenberg–Marquardt for small problems from several starting points at once, with early stopping.
+"""Least squares: covariances, and Levenberg–Marquardt from several starts with early stopping.
 
 The joint fit uses optimistix's solver, which is compiled for one problem. Here an evaluation is
 costly, covers many points in one call and runs on the host: all starting points step together,

@@ -3,12 +3,15 @@
 import difflib
 import functools
 import importlib
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar, cast
 
 C = TypeVar("C", bound=type)
 F = TypeVar("F", bound=Callable[..., Any])
+
+_WITHIN = ("snrmjax", "equinox", "abc")
 
 
 def near_miss(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
@@ -95,9 +98,12 @@ def take_former(cls: type, names: Mapping[str, str]) -> None:
 
 
 def _warn(former: str, present: str) -> None:
-    """Warn the caller of the caller that a name is a former one."""
+    """Warn the user's line, outside of this package and of Equinox, that a name is a former one."""
+    frame, level = sys._getframe(1), 2
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in _WITHIN:
+        frame, level = frame.f_back, level + 1
     warnings.warn(
         f"{former} is now {present}: the former name goes in the next release.",
         DeprecationWarning,
-        stacklevel=3,
+        stacklevel=level - 1,
     )

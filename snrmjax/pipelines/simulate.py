@@ -125,7 +125,7 @@ def simulate_responses(
                     n_failed=further.n_failed,
                 )
             )
-        for order in subharmonic:
+        for order in dict.fromkeys(subharmonic):
             longer = [curve for curve in every if curve.subharmonic == order]
             notes.append(_subharmonics_found(force, model.modes.force_unit, order, longer))
             of_force += longer
@@ -259,7 +259,8 @@ def _notes_on_force(
     model: Structure, curves: Sequence[ResponseCurve], ends: tuple[float, float], isolated: bool
 ) -> Iterator[Fact]:
     """Ranges without a known stable response to one force, and idle elements."""
-    shown, unit = [c for c in curves if len(c.frequency)], model.modes.force_unit
+    shown = [c for c in curves if len(c.frequency) and c.subharmonic == 1]
+    searched, unit = any(c.subharmonic == 2 for c in curves), model.modes.force_unit
     if not shown:
         return
     at = {"force": curves[0].force, "unit": unit}
@@ -275,7 +276,7 @@ def _notes_on_force(
             **(at | hertz),
             isolated=isolated,
             wells=sum(bool(state.stable) for state in equilibria(model)),
-            doublings_hz=doublings,
+            doublings_hz=() if searched else doublings,
         )
     for idle in idle_elements(model, shown):
         yield Fact("element_idle", **at, **idle._asdict())

@@ -115,11 +115,11 @@ BAD = {
     "empty": ("", (), "bad.csv is empty"),
     "too short for a decay": (
         table(**{k: v[:200] for k, v in FREE.items()}),
-        *(("resonant_decay",), "resonant_decay: 12 cycles are needed, or 5 in which"),
+        *(("resonant_decay",), "resonant_decay: bad.csv: 12 cycles are needed, or 5 in which"),
     ),
     "clipped": (
         table(**_changed(FREE, velocity_m_s=np.clip(VELOCITY, -0.1, 0.1))),
-        *(("restoring_force",), "restoring_force: the record stays at its"),
+        *(("restoring_force",), "restoring_force: bad.csv: the record stays at its"),
     ),
     "milliseconds": (
         table(**_changed(FREE, time_s=1000 * TIME)),
@@ -127,7 +127,7 @@ BAD = {
     ),
     "too slow sampling": (
         table(**{k: v[::8] for k, v in FREE.items()}),
-        *(("resonant_decay",), "resonant_decay: 8 samples a cycle are needed"),
+        *(("resonant_decay",), "resonant_decay: bad.csv: 8 samples a cycle are needed"),
     ),
     "unknown sensor": (
         table(time_s=TIME, root__velocity_m_s=VELOCITY), (), "has no motion of the sensor tip",
@@ -151,7 +151,7 @@ BAD = {
     ),
     "broadband in volts": (
         table(**_changed(FREE, velocity_m_s=NOISE[::-1], drive_v=NOISE)),
-        *(("restoring_force",), "restoring_force: a forced record needs its force in N"),
+        *(("restoring_force",), "restoring_force: bad.csv: a forced record needs its force in N"),
     ),
 }  # fmt: skip
 

@@ -122,7 +122,7 @@ def test_the_energy_that_an_iwan_joint_loses_is_segalmans():
         loss = np.sum(force * u * -np.sin(angle)) * angle[1]
         assert loss == pytest.approx(4 * density * u**2.5 / (1.5 * 2.5), rel=1e-4)
     far = np.asarray(joint.cycle_force(jnp.asarray(3 * end * np.cos(angle)), jnp.zeros(4096)))
-    assert far.max() == pytest.approx(10.0, rel=1e-9)
+    assert abs(far[1024]) == pytest.approx(10.0, rel=1e-9)  # all sliders slip
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)

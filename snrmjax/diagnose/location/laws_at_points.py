@@ -1,8 +1,4 @@
-"""Fits of force laws at an attachment point to the sensors' records.
-
-Stuck dry friction has any reaction up to the friction limit: evaluated along a motion below its
-measurement error, its law would give the full force in the direction of that error.
-"""
+"""Fits of force laws at an attachment point to the sensors' records."""
 
 from typing import Any, NamedTuple
 
@@ -44,6 +40,9 @@ def stuck_forces(
     limit: float, required: Complex[np.ndarray, " state"], element: SurroundedElement
 ) -> ElementForces:
     """The forces of stuck friction: the required ones, up to the fundamental of full sliding.
+
+    It has any reaction up to the friction limit: evaluated along a motion below its measurement
+    error, its law would give the full force in the direction of that error.
 
     Arguments: `limit`: friction limit in N; `required`: fundamental of the force that the sensors
     require in each state. The motion is unchanged, and the force has no other harmonics.

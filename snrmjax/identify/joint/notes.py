@@ -217,7 +217,8 @@ def outlying_states(fit: Any) -> np.ndarray:
     """
     residuals = unweighted_residuals(fit)
     level, frequency = np.asarray(fit.data.level), np.asarray(fit.data.frequency)
-    beyond = farthest_by_chance(len(residuals))
+    robust = bool(np.any(np.asarray(fit.data.weight) != 1))
+    beyond = farthest_by_chance(len(residuals), robust=robust)
     alone = np.zeros_like(residuals)
     for rows in states_of_levels(level, frequency):
         for k, row in enumerate(rows):

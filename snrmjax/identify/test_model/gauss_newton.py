@@ -107,6 +107,7 @@ class Iterate(NamedTuple):
     mean: Float[np.ndarray, " unknown"]
     residuals: Float[np.ndarray, "state part"]
     errors: Float[np.ndarray, "state input"]
+    weight: Float[np.ndarray, " state"]  # of the states in `equations`
 
 
 class GaussNewton:
@@ -206,7 +207,8 @@ class GaussNewton:
         residual = (linear.rows - linear.design @ goal).reshape(-1, 2)
         value = objective(point)[0]
         if k <= _SETTLED or self.power_likelihood or value > self.likelihood:
-            self.best = Iterate(point, value, linear.equations, goal, residual / noise, step.errors)
+            weight, white = self.balance.weight, residual / noise
+            self.best = Iterate(point, value, linear.equations, goal, white, step.errors, weight)
         std = np.sqrt(np.diag(covariance) + 1e-300)
         self.converged = (
             k > _SETTLED and np.max(np.abs(step.unknowns - self.mean) / std) < _TOLERANCE

@@ -60,7 +60,7 @@ _ALL = Rounds()
 _NOISE_ROUNDS = 3  # of estimating the noise components, at most
 _SAME_NOISE = 0.1  # relative convergence tolerance of the components
 _LITTLE_MORE = 2.0  # ratio of phase spread to frequency scatter: more is not phase control
-_ONE_TEST_IN = 100  # tests has a false outlier
+_FALSE_OUTLIERS = 0.01  # expected in a test with normal noise
 _STUDENT_STD = float(np.sqrt(priors.STUDENT_FREEDOM / (priors.STUDENT_FREEDOM - 2)))
 _REACH = 3.0  # dynamic stiffnesses that ω̃² may lie outside the tested range of Ω²
 
@@ -264,10 +264,11 @@ def fit_test(
     best = solver.best
     if best is None:
         raise InputError(f"`rounds.most` must be at least one, not {rounds.most}.")
-    # 1σ of level errors from few levels is uncertain: widened as Student's t. Their mean is not
-    # projected out here: states off resonance determine it; of others the prior of the curves would
-    # assign it a part of the damping. A part correlated with force is attributed to the curves. The
-    # bands allow for both as level errors (`exchanged`).
+    # 1σ of level errors from few levels is uncertain: widened as Student's t. The common level
+    # error is not projected out: states off resonance determine it. States at one phase do not, and
+    # the roughness prior would shift a part of the damping to it: there the projected equations
+    # give the mean. A part correlated with force is attributed to the curves; the bands allow for
+    # both as level errors (`exchanged`).
     last = solver.balance.linearised(best.mean, best.errors, apart=False)
     fraction = best.equations.fraction * (priors.STUDENT_INFORMATION if robust else 1.0)
     equations = last.equations._replace(fraction=fraction)
@@ -301,21 +302,21 @@ def fit_test(
         grid = roughness_grid(objective, best.point, bounds)
         point, summary = averaged(grid, gaussian)
     flat = objective_of(best.equations, states, terms, layout, flat=True)
-    tails = _log_tails(best.residuals, solver.balance.weight) if robust else 0.0
+    tails = _log_tails(best.residuals, best.weight) if robust else 0.0
     posterior = TestPosterior(
         states,
         terms,
         summary.mean,
         summary.covariance,
         hyper_at(point, terms),
-        laplace_evidence(objective, best.point, bounds) + tails,
+        laplace_evidence(objective, best.point, bounds) + best.equations.fraction * tails,
         _log_likelihood(best) + tails,
         best.errors,
         best.residuals * np.exp(best.point[NOISE] - point[NOISE]),
         summary.effective_unknowns,
         layout,
         differing_levels(flat, best.point, bounds, states) if compare_levels else (False,) * 4,
-        solver.balance.weight,
+        best.weight,
         best.equations.fraction,
         solver.converged,
         solver.balance.in_order,
@@ -416,26 +417,32 @@ def students_factor(freedom: float) -> float:
     return float(stdtrit(max(freedom, 2), 0.975) / ndtri(0.975))
 
 
-def farthest_by_chance(n_states: int, expected: float = 1 / _ONE_TEST_IN) -> float:
+def farthest_by_chance(
+    n_states: int, expected: float = _FALSE_OUTLIERS, *, robust: bool = False
+) -> float:
     """Magnitude of whitened residuals that `expected` of the states exceed by chance (Bonferroni).
 
-    For two normal residuals of each of n states, n exp(−r²/2) are expected beyond r.
+    For two normal residuals of each of n states, n exp(−r²/2) are expected beyond r. With `robust`
+    noise the residuals are in units of its scale, which is smaller than its 1σ.
     """
-    return float(np.sqrt(2 * np.log(max(1, n_states) / expected)))
+    return (_STUDENT_STD if robust else 1.0) * float(
+        np.sqrt(2 * np.log(max(1, n_states) / expected))
+    )
 
 
 def _with_likely_noise(fit: Callable[..., TestPosterior]) -> TestPosterior:
-    """The posterior with normal noise, or with outliers where there are and that is more probable.
+    """The posterior with normal noise, or with Student's t where outliers are present and it gives
+    the records a larger likelihood.
 
-    Without outliers heavier tails may be the more probable ones too, where the stated noise is too
-    small.
+    Without outliers it may do so too, where the stated noise is too small.
     """
     normal = fit(robust=False)
     n, largest = len(normal.weight), float(np.max(np.hypot(*normal.residuals.T)))
-    # An outlier hides in the noise and level errors that it enlarges: a low threshold.
+    # An outlier hides in the noise and level errors that it enlarges: a second fit already where
+    # one state is expected to lie as far by chance, as in 63 % of tests without outliers.
     if largest <= farthest_by_chance(n, expected=1.0):
         return normal
     tails = fit(robust=True)
     farthest = float(np.max(np.hypot(*tails.residuals.T) / np.sqrt(tails.weight)))
-    has_outliers = farthest > _STUDENT_STD * farthest_by_chance(n)
-    return tails if has_outliers and tails.log_evidence > normal.log_evidence else normal
+    has_outliers = farthest > farthest_by_chance(n, robust=True)
+    return tails if has_outliers and tails.log_likelihood > normal.log_likelihood else normal

@@ -39,7 +39,7 @@ class MainsTone(NamedTuple):
 def mains_hum(time: np.ndarray, signal: np.ndarray, reading: DecayReading) -> list[MainsTone]:
     """Steady mains tones in the residual of the smooth decay.
 
-    A line that decays as a harmonic of the mode itself does is none.
+    A line that decays like a harmonic of the mode is not counted as hum.
     """
     carrier = Carrier(reading.carrier.time, reading.smooth.level)
     inside = (time >= carrier.time[0]) & (time <= carrier.time[-1])

@@ -284,7 +284,9 @@ class IwanMicroslip(AbstractSliders):
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """Masing's rule between two turning points."""
-        high, low, falling = _turning_points(displacement)
+        valid, _, falling = _turning_points(displacement)
+        path = with_extremes(displacement)
+        high, low = jnp.max(path) + 0 * valid, jnp.min(path)
         half_range = 0.5 * (high - low)
         excursion = jnp.where(falling, high - displacement, displacement - low) / 2
         branch = self._lost(half_range) - 2 * self._lost(excursion)

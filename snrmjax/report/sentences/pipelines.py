@@ -69,8 +69,8 @@ def _no_stable_response(
     if wells > 1 and not isolated:
         further = "; motions across several wells were not searched: `--isolated` does"
     doubled = "".join(
-        f" Period doubling at {hertz:.5g} Hz: the stable motion there repeats after two periods of "
-        "the force, which this harmonic balance does not represent."
+        f" Period doubling at {hertz:.5g} Hz: `--subharmonic 2` follows the motions of twice the "
+        "period that begin there."
         for hertz in doublings_hz
     )
     return (

@@ -29,7 +29,7 @@ from snrmjax.simulate.continuation.response_curve import (
 )
 from snrmjax.simulate.solutions.branch_switching import add_branches
 from snrmjax.simulate.solutions.from_rest import curves_from_rest, curves_where_sweeps_land
-from snrmjax.simulate.solutions.subharmonics import subharmonic_responses
+from snrmjax.simulate.solutions.subharmonics import subharmonic_orders, subharmonic_responses
 
 DEFAULT_STEPS = StepControl()
 _AT_FOLD = 1e-3  # relative distance in frequency of a fold and the last stable point
@@ -96,7 +96,7 @@ def forced_response(
     force. Their `frequency` is that of the force, their coefficients and velocities are those of
     the harmonics of Ω/n, and their multipliers over n periods of the force. A search can miss one.
     Raises `ValueError` for a force that is not positive, for an empty or infinite frequency
-    range and for a subharmonic below 2.
+    range and for a subharmonic that is no integer of 2 or more.
     Not differentiable: call it outside, and differentiate single motions of its curve:
     `snrmjax.simulate.periodic_motion`, or `snrmjax.simulate.TrackedMotion` where parameters move
     far.
@@ -108,13 +108,14 @@ def forced_response(
     """
     loads = positive("forces", forces)
     ends = frequency_range(from_frequency, to_frequency)
+    orders = subharmonic_orders(subharmonic)
     models = [simulated_structure(model)] * len(loads)
     settings = ResponseSettings(harmonic_order, n_samples, steps, stability)
     curves = _chunk_of_curves(models, loads, ends, settings, alone=len(loads) == 1)
     found: list[ResponseCurve] = []
     for parts in curves:
         found += parts
-        for order in np.atleast_1d(np.asarray(subharmonic, dtype=int)).tolist():
+        for order in orders:
             found += subharmonic_responses(
                 models[0], parts, order, ends, steps, n_samples=n_samples, stability=stability
             )

@@ -36,6 +36,15 @@ _REACH = 2.0  # ratio of frequencies to which the free oscillation of a mode is 
 _SUBHARMONIC = 1e-3  # least fraction of a motion in the harmonics that are not those of the force
 
 
+def subharmonic_orders(given: int | Sequence[int]) -> tuple[int, ...]:
+    """The different numbers of periods, each once; `ValueError` for what is none."""
+    several = np.atleast_1d(np.asarray(given, dtype=float)).tolist()
+    for order in several:
+        if order != int(order) or order < 2:
+            raise InputError(f"`subharmonic` must be an integer of 2 or more, but is {order:g}.")
+    return tuple(dict.fromkeys(int(order) for order in several))
+
+
 def subharmonic_responses(
     model: Structure,
     known: Sequence[ResponseCurve],
@@ -54,10 +63,8 @@ def subharmonic_responses(
     frequencies. The search is not a proof that there are no others.
 
     Arguments: `known` responses with the period of the force, of `forced_response`; `ends` in
-    rad/s. Raises `ValueError` for an order below 2.
+    rad/s.
     """
-    if order < 2:
-        raise InputError(f"`subharmonic` must be 2 or more, but is {order}.")
     known = [curve for curve in known if len(curve.frequency) > 1]
     if not known:
         return []

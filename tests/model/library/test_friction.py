@@ -323,6 +323,8 @@ def test_states_moved_from_sample_to_sample_are_the_steady_ones(name):
     settled, _ = jax.lax.scan(move, start, (q, v))
     _, (states, force) = jax.lax.scan(move, settled, (q, v))
     np.testing.assert_allclose(states, settled_states(effect, q, v), rtol=0, atol=1e-15)
+    exact = settled_states(effect, q, v) @ -effect.sliders().stiffness
+    np.testing.assert_allclose(force, exact, rtol=0, atol=1e-13)
     # The same thresholds as the cycle's own choice, which turns up to h²/8·21 beyond its samples.
     step = 9.0 * 7.6e-5 * 21
     harmonics = np.fft.rfft(force - cycle(EFFECTS[name], q, v))[:8] / 256

@@ -159,5 +159,5 @@ def test_a_superharmonic_resonance_is_named(third):
 
 
 def test_an_order_below_two_is_refused(third):
-    with pytest.raises(InputError, match="`subharmonic` must be 2 or more, but is 1"):
+    with pytest.raises(InputError, match="`subharmonic` must be an integer of 2 or more, but is 1"):
         forced_response(third[0], [FORCE], 2.9, 4.0, harmonic_order=3, subharmonic=1)
