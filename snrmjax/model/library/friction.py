@@ -70,8 +70,10 @@ def corrected_positions(
     See `with_slip_corners`.
     """
     position = _settled(with_extremes(displacement), slip_displacement)
-    correct = jax.vmap(with_slip_corners, (1, None, 0), 1)
-    return correct(position, displacement, slip_displacement)
+    return _with_corners(position, displacement, slip_displacement)
+
+
+_with_corners = jax.vmap(with_slip_corners, (1, None, 0), 1)
 
 
 def _settled(
@@ -105,12 +107,13 @@ def _settled(
 def slipped_position(
     displacement: Float[Array, " time"], slip_displacement: Float[Array, " slider"]
 ) -> Float[Array, "time slider"]:
-    """`settled_positions` of a cycle with two turning points; NaN with more."""
+    """`corrected_positions` of a cycle with two turning points; NaN with more."""
     slip, q = slip_displacement, displacement[:, None]
     high, low, falling = _turning_points(displacement)
     down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
     stuck = jnp.clip(0.0, high - slip, low + slip)
-    return jnp.where(2 * slip < high - low, jnp.where(falling[:, None], down, up), stuck)
+    position = jnp.where(2 * slip < high - low, jnp.where(falling[:, None], down, up), stuck)
+    return _with_corners(position, displacement, slip)
 
 
 class AbstractSliders(AbstractHysteresis):
@@ -284,9 +287,7 @@ class IwanMicroslip(AbstractSliders):
 
     def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
         """Masing's rule between two turning points."""
-        valid, _, falling = _turning_points(displacement)
-        path = with_extremes(displacement)
-        high, low = jnp.max(path) + 0 * valid, jnp.min(path)
+        high, low, falling = _turning_points(displacement)
         half_range = 0.5 * (high - low)
         excursion = jnp.where(falling, high - displacement, displacement - low) / 2
         branch = self._lost(half_range) - 2 * self._lost(excursion)
@@ -301,15 +302,16 @@ class IwanMicroslip(AbstractSliders):
         return jnp.where(stretch > 0, self.coefficient * safe**self.exponent, 0.0)
 
 
-def _turning_points(q: Float[Array, " time"]) -> tuple[Array, Array, Array]:
-    """Largest and smallest sample, NaN with more than two turning points, and falling samples."""
+def _turning_points(displacement: Float[Array, " time"]) -> tuple[Array, Array, Array]:
+    """Largest and smallest value, NaN with more than two turning points, and falling samples."""
+    q = with_extremes(displacement).reshape(-1)
     n = q.shape[0]
     top, bottom = jnp.argmax(q), jnp.argmin(q)
     since, fall = (jnp.arange(n) - top) % n, (bottom - top) % n
     ahead = jnp.roll(q, -1) - q
     only_two = jnp.all(jnp.where(since < fall, ahead <= 0, ahead >= 0))
     valid = jnp.where(only_two, 0.0, jnp.nan)
-    return q[top] + valid, q[bottom] + valid, since <= fall
+    return q[top] + valid, q[bottom] + valid, (since <= fall)[1::2]
 
 
 class CoulombFriction(AbstractHysteresis):

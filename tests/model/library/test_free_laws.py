@@ -85,7 +85,8 @@ def test_sliders_of_a_slip_law_against_a_plain_march():
     whole = -law("slip_law").settled_states(jnp.asarray(q), jnp.zeros(256)) @ k
     np.testing.assert_allclose(whole, last, rtol=0, atol=1e-12)
     quick = law("slip_law").quick_cycle_force(jnp.asarray(q), jnp.zeros(256))
-    np.testing.assert_allclose(quick, whole, rtol=0, atol=1e-12)
+    cycle = law("slip_law").cycle_force(jnp.asarray(q), jnp.zeros(256))
+    np.testing.assert_allclose(quick, cycle, rtol=0, atol=1e-12)
 
 
 def test_the_first_loading_of_a_slip_law_loses_what_has_slipped():
