@@ -6,6 +6,7 @@ import importlib
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from types import FrameType
 from typing import Any, TypeVar, cast
 
 C = TypeVar("C", bound=type)
@@ -99,7 +100,8 @@ def take_former(cls: type, names: Mapping[str, str]) -> None:
 
 def _warn(former: str, present: str) -> None:
     """Warn the user's line, outside of this package and of Equinox, that a name is a former one."""
-    frame, level = sys._getframe(1), 2
+    frame: FrameType | None = sys._getframe(1)
+    level = 2
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in _WITHIN:
         frame, level = frame.f_back, level + 1
     warnings.warn(
