@@ -138,7 +138,7 @@ def test_the_force_of_a_remainder_has_its_describing_function():
     (law,) = remainder_laws(problem, {"stiffness": part.remainder})
     t = (np.arange(2000) + 0.5) * 2 * np.pi / 2000
     left = part.remainder
-    for k in (20, 40, 55):
+    for k in (0, 20, 40, 55, -1):
         a = problem.readings.largest * left.velocity[k] / left.velocity[-1]
         force = np.array(law.cycle_force(a * np.cos(t), -a * OMEGA * np.sin(t)))
         stiffness = 2 * np.mean(force * np.cos(t)) / a / OMEGA**2
