@@ -316,7 +316,7 @@ def fit_test(
         summary.effective_unknowns,
         layout,
         differing_levels(flat, best.point, bounds, states) if compare_levels else (False,) * 4,
-        best.weight,
+        solver.balance.weight,
         best.equations.fraction,
         solver.converged,
         solver.balance.in_order,
