@@ -11,7 +11,7 @@ from snrmjax.model.library.free_laws import DisplacementDampingLaw, StiffnessLaw
 _KNOTS = 16
 _ANGLES = 200
 _WEIGHTS = np.geomspace(1e4, 1e-4, 33)  # of the roughness, the smoothest law first
-_WITHIN = 0.5  # 1σ: a larger distance would bias the peaks, where the law ends
+_AT_THE_TOP = 0.5  # 1σ: a larger distance would bias the highest peaks, where the law ends
 _LEAST_STD = 1e-3  # of the largest remainder: the accuracy that a law needs
 
 
@@ -44,9 +44,9 @@ def _secants(
     """Secants s at knots for which the mean of 2 s(a |cos t|) cos² t, or sin² t, is the remainder.
 
     Piecewise linear in ln q. The inverse of an average amplifies errors: the law is the smoothest
-    one (second differences) whose average is the remainder within half its 1σ at every point, 1σ
-    being at least 0.1 % of the largest: the discrepancy principle of Morozov, Sov. Math. Dokl. 7
-    (1966) 414.
+    one (second differences) whose average is the remainder within its rms 1σ, and within half of it
+    at the largest amplitude; 1σ is at least 0.1 % of the largest. See the discrepancy principle of
+    Morozov, Sov. Math. Dokl. 7 (1966) 414.
     """
     t = (np.arange(_ANGLES) + 0.5) * 0.5 * np.pi / _ANGLES
     weight = 2 * (np.cos(t) ** 2 if in_phase else np.sin(t) ** 2) / _ANGLES
@@ -63,6 +63,7 @@ def _secants(
         both = np.vstack([rows, weight_of_roughness * roughness])
         wanted = np.concatenate([goal, np.zeros(len(roughness))])
         secant = np.linalg.lstsq(both, wanted, rcond=None)[0]
-        if np.max(np.abs(rows @ secant - goal)) <= _WITHIN:
+        off = rows @ secant - goal
+        if np.sqrt(np.mean(off**2)) <= 1 and abs(off[-1]) <= _AT_THE_TOP:
             break
     return secant
