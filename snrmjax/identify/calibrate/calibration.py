@@ -76,8 +76,8 @@ def calibrate_model(
     Raises `ValueError` for unknown or repeated names, for sensors other than the model's, for an
     unknown force or phase, for levels' errors below zero and for too few data.
     Validity: motions with the period of the force. Errors of velocity enter to first order. Inside
-    an internal resonance several motions share one fundamental; without `prescribed_modes` the one
-    that continues from small amplitudes is taken.
+    an internal resonance several motions have the same fundamental; without `prescribed_modes` the
+    one that continues from small amplitudes is taken.
     Not differentiable: differentiate `inverse_force`.
     Reference: the formulation is this package's own.
     """

@@ -60,8 +60,6 @@ _ALL = Rounds()
 _NOISE_ROUNDS = 3  # of estimating the noise components, at most
 _SAME_NOISE = 0.1  # relative convergence tolerance of the components
 _LITTLE_MORE = 2.0  # ratio of phase spread to frequency scatter: more is not phase control
-_FALSE_OUTLIERS = 0.01  # expected in a test with normal noise
-_STUDENT_STD = float(np.sqrt(priors.STUDENT_FREEDOM / (priors.STUDENT_FREEDOM - 2)))
 _REACH = 3.0  # dynamic stiffnesses that ω̃² may lie outside the tested range of Ω²
 
 
@@ -418,14 +416,14 @@ def students_factor(freedom: float) -> float:
 
 
 def farthest_by_chance(
-    n_states: int, expected: float = _FALSE_OUTLIERS, *, robust: bool = False
+    n_states: int, expected: float = priors.FALSE_OUTLIERS, *, robust: bool = False
 ) -> float:
     """Magnitude of whitened residuals that `expected` of the states exceed by chance (Bonferroni).
 
     For two normal residuals of each of n states, n exp(−r²/2) are expected beyond r. With `robust`
     noise the residuals are in units of its scale, which is smaller than its 1σ.
     """
-    return (_STUDENT_STD if robust else 1.0) * float(
+    return (priors.STUDENT_STD if robust else 1.0) * float(
         np.sqrt(2 * np.log(max(1, n_states) / expected))
     )
 

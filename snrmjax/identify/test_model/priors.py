@@ -189,6 +189,12 @@ DISCREPANCY_LENGTH = np.radians(30.0)
 STUDENT_FREEDOM = 4.0
 """Student's t degrees of freedom of noise with outliers: one state in 20 lies beyond 3σ."""
 
+STUDENT_STD = float(np.sqrt(STUDENT_FREEDOM / (STUDENT_FREEDOM - 2)))
+"""Its 1σ over its scale."""
+
+FALSE_OUTLIERS = 0.01
+"""States expected to count as outliers in a test with normal noise: in one test of a hundred."""
+
 STUDENT_INFORMATION = (STUDENT_FREEDOM + 2) / (STUDENT_FREEDOM + 4)
 """Fisher information of the bivariate distribution over that of the normal ones of its weights."""
 
