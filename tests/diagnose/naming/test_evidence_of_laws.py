@@ -19,6 +19,7 @@ from snrmjax.diagnose.naming import hypotheses, parts
 from snrmjax.diagnose.naming.columns import hypothesis_columns
 from snrmjax.diagnose.naming.evidence import remainder_stds
 from snrmjax.diagnose.naming.hypotheses import hypotheses_of
+from snrmjax.diagnose.naming.parts import Remainder
 from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.naming.rows import Cell, problem_of, solved
 from snrmjax.diagnose.readings import ModelMotion, readings_of
@@ -143,6 +144,27 @@ def test_the_force_of_a_remainder_has_its_describing_function():
         force = np.array(law.cycle_force(a * np.cos(t), -a * OMEGA * np.sin(t)))
         stiffness = 2 * np.mean(force * np.cos(t)) / a / OMEGA**2
         assert stiffness == pytest.approx(left.value[k], abs=0.05 * np.ptp(left.value))
+
+
+def test_the_force_of_an_uncertain_remainder_is_smooth_and_right_at_the_top():
+    """A cubic spring, 0.02 x² on average, ± 5 % of its largest value, with errors of half that."""
+    problem, _ = named(nothing, nothing, noise=2e-4, levels=10)
+    x = np.geomspace(0.02, 1.0, 60)
+    errors = 5e-4 * np.cos(5 * np.arange(60))
+    curves = {"laws": 0 * x, "state_velocity": x, "state_change": x}
+    part = Remainder(
+        x, 0.02 * x**2 + errors, std=1e-3 + 0 * x, rms=0.01, significant=True, **curves
+    )
+    (law,) = remainder_laws(problem, {"stiffness": part})
+    t = (np.arange(2000) + 0.5) * 2 * np.pi / 2000
+    largest = problem.readings.largest
+    force = np.array(law.cycle_force(largest * np.cos(t), -largest * OMEGA * np.sin(t)))
+    top = 2 * np.mean(force * np.cos(t)) / largest / OMEGA**2
+    assert top == pytest.approx(0.02, abs=6e-4)
+    secant = np.asarray(law.restoring_force / law.displacement) / OMEGA**2
+    knots = np.asarray(law.displacement) / largest
+    # Least squares that follow the errors are off by 7e-4.
+    assert np.max(np.abs(secant - 0.02 * 4 / 3 * knots**2)) < 5e-4
 
 
 def test_pairs_left_out_are_irrelevant():
