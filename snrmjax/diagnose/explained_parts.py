@@ -54,11 +54,10 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     unknown = predictions.chosen.phase_unknown[:, 0]
     if unknown.any():
         predictions = _with_likely_phases(predictions, data)
-    if not predictions.chosen.orders or unknown.any():
-        unseen: tuple[type, ...] = (AbstractAddedMode,)
-        if unknown.any() or not predictions.given.potential.monomials:
-            unseen = (*unseen, ModeShapeChange)
-        kinds = [k for k in kinds if not issubclass(EFFECTS[k], unseen)]
+    if unknown.any():
+        kinds = [k for k in kinds if not issubclass(EFFECTS[k], AbstractAddedMode | ModeShapeChange)]
+    elif not (predictions.chosen.orders or predictions.given.potential.monomials):
+        kinds = [k for k in kinds if not issubclass(EFFECTS[k], ModeShapeChange)]
     readings = _readings(predictions, data, unknown)
     if readings.posterior.phase_is_controlled:
         kinds = [k for k in kinds if _shows_at_one_phase(k)]

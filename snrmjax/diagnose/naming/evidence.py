@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cholesky, solve_triangular
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import log_ndtr
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.kinds.registry import hypothesis_of
@@ -183,8 +183,9 @@ class LawSums(NamedTuple):
         precision = square[..., None] + narrow
         mean = b[..., None] / precision
         value = 0.5 * b[..., None] * mean - 0.5 * np.log(precision / narrow)
-        value = value + _log_within(self.low[:, None], self.high[:, None], mean, np.sqrt(precision))
-        return logsumexp(value, axis=-1) - np.log(value.shape[-1])
+        by_column = [np.moveaxis(one, -2, 0) for one in (mean, np.sqrt(precision))]
+        within = np.moveaxis(_log_within(self.low, self.high, *by_column), 0, -2)
+        return _log_mean_exp(value + within, -1)
 
     def _likely(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """Approximate upper bound of pairs' log evidence, with half a nat of slack for each law.
@@ -212,11 +213,11 @@ class LawSums(NamedTuple):
         det = np.maximum(p * q - c * c, 1e-12 * p * q)
         x, y = (q * one - c * two) / det, (p * two - c * one) / det
         value = 0.5 * (one * x + two * y) - 0.5 * np.log(det / (first * second))
+        value = _log_mean_exp(value.reshape(len(i), -1), 1)
+        # Limits matter little for a narrow prior, which a significant law makes improbable.
         for k, mean, precision in ((i, x, det / q), (j, y, det / p)):
-            limits = self.low[k][:, None, None], self.high[k][:, None, None]
-            value = value + _log_within(*limits, mean, np.sqrt(precision))
-        n = value.shape[1] * value.shape[2]
-        value = logsumexp(value.reshape(len(i), n), axis=1) - np.log(n)
+            widest = mean[:, -1, -1], np.sqrt(precision[:, -1, -1])
+            value = value + _log_within(self.low[k], self.high[k], *widest)
         return value + np.log(2 * self.prior[i] * self.prior[j])
 
 
@@ -247,15 +248,31 @@ class HarmonicSums(NamedTuple):
         return base + np.log(priors.EFFECT_COUNTS[0]), value
 
 
+def _log_mean_exp(values: np.ndarray, axis: int) -> np.ndarray:
+    most = np.max(values, axis=axis, keepdims=True)
+    return np.squeeze(most, axis) + np.log(np.mean(np.exp(values - most), axis=axis))
+
+
 def _log_within(
-    low: np.ndarray, high: np.ndarray, mean: np.ndarray, root_precision: np.ndarray
-) -> np.ndarray:
-    """ln of the probability of N(mean, 1/root_precision²) between limits."""
-    lower, upper = (low - mean) * root_precision, (high - mean) * root_precision
+    low: Float[np.ndarray, " column"],
+    high: Float[np.ndarray, " column"],
+    mean: Float[np.ndarray, "column *rest"],
+    root_precision: Float[np.ndarray, "column *rest"],
+) -> Float[np.ndarray, "column *rest"]:
+    """ln of the probability of N(mean, 1/root_precision²) between every column's limits."""
+    value = np.zeros(mean.shape)
+    below, above = np.isfinite(low), np.isfinite(high)
+    for some, limit, sign in ((below & ~above, low, 1), (above & ~below, high, -1)):
+        off = mean[some] - np.expand_dims(limit[some], tuple(range(1, mean.ndim)))
+        value[some] = log_ndtr(sign * off * root_precision[some])
+    both = below & above
+    limits = (np.expand_dims(one[both], tuple(range(1, mean.ndim))) for one in (low, high))
+    lower, upper = ((one - mean[both]) * root_precision[both] for one in limits)
     flipped = lower > 0  # in the lower tail, where differences are exact
     lower, upper = np.where(flipped, -upper, lower), np.where(flipped, -lower, upper)
-    below, above = log_ndtr(lower), log_ndtr(upper)
-    return above + np.log1p(-np.exp(below - above))
+    log_lower, log_upper = log_ndtr(lower), log_ndtr(upper)
+    value[both] = log_upper + np.log1p(-np.exp(log_lower - log_upper))
+    return value
 
 
 def detectable_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.ndarray, " column"]:

@@ -31,9 +31,10 @@ from snrmjax.diagnose.naming.rows import (
 from snrmjax.diagnose.readings import Readings
 from snrmjax.identify.test_model.priors import LEVELS
 
-_ROUNDS = 3  # of refined shapes
+_ROUNDS = 3  # of refined shapes and of strengths
 _COARSE = 40.0  # nats that a coarse shape may be below the best
 _REACH = 16.0  # nats below the best within which a column is kept while shapes are refined
+_TRIED = 3  # columns of a kind that are made exact for their strengths
 _COUNTS = 0.02  # probability from which on a shape is refined
 _EXTENDED = 4  # sets of laws that are extended by one more
 _LEAST = 8.0  # nats below the most probable answer within which hypotheses are kept
@@ -47,12 +48,14 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
     """All relevant hypotheses, the most probable first, with refined shapes."""
     problem = _with_likeliest_length(readings, hypothesis_columns(readings, kinds))
     for _ in range(_ROUNDS):
-        cells, alone = _compared(problem, 2, _REACH)
-        problem = _exact_at_strengths(problem, cells)
-        counts = _worth_dividing(problem, cells, alone)
+        cells, alone = _compared(problem, 2)
+        near = [cell for cell in alone if cell.log_evidence > cells[0].log_evidence - _REACH]
+        of_kinds = _best_of_kinds(problem, alone)
+        problem = _exact_at_strengths(problem, [*cells, *alone])
+        counts = _worth_dividing(problem, cells, of_kinds)
         if not counts:
             break
-        kept = {*_best_of_kinds(problem, alone), *(k for cell in cells for k in cell.columns)}
+        kept = {k for cell in (*of_kinds, *near, *cells) for k in cell.columns}
         finer = [one for k in counts for one in problem.columns[k].divided(readings)]
         left = [problem.columns[k] for k in sorted(kept - {*counts})]
         problem = problem.with_columns([*left, *finer])
@@ -65,19 +68,30 @@ def best_hypotheses(readings: Readings, kinds: Iterable[str]) -> tuple[Problem, 
 
 
 def _exact_at_strengths(problem: Problem, cells: list[Cell]) -> Problem:
-    """The problem with columns exact for their strengths in the best hypothesis with each."""
+    """The problem with columns exact for their strengths in the most probable hypotheses.
+
+    Of every kind at least `_TRIED` columns: far from the strength a column is misleading.
+    """
     best: dict[int, Cell] = {}
-    for cell in cells:
+    tried: dict[str, int] = {}
+    least = cells[0].log_evidence - _LEAST
+    for cell in sorted(cells, key=lambda cell: -cell.log_evidence):
         for k in cell.columns:
-            if hypothesis_of(problem.columns[k].kind).unit is not None:
-                best.setdefault(k, cell)
+            kind = problem.columns[k].kind
+            if hypothesis_of(kind).unit is None or k in best:
+                continue
+            if cell.log_evidence > least or tried.get(kind, 0) < _TRIED:
+                best[k] = cell
+                tried[kind] = tried.get(kind, 0) + 1
     if not best:
         return problem
-    columns = list(problem.columns)
-    for k, cell in best.items():
-        strength = float(solved(problem, cell).mean[cell.columns.index(k)])
-        columns[k] = columns[k].exact_at(problem.readings, strength)
-    return problem.with_columns(columns)
+    for _ in range(_ROUNDS):
+        columns = list(problem.columns)
+        for k, cell in best.items():
+            strength = float(solved(problem, cell).mean[cell.columns.index(k)])
+            columns[k] = columns[k].exact_at(problem.readings, strength)
+        problem = problem.with_columns(columns)
+    return problem
 
 
 def _with_level_errors_of_laws(problem: Problem, cells: list[Cell]) -> Problem:
@@ -147,23 +161,24 @@ def _with_likeliest_length(readings: Readings, columns: list[Column]) -> Problem
 
 
 def _worth_dividing(
-    problem: Problem, cells: list[Cell], alone: Float[np.ndarray, " column"]
+    problem: Problem, cells: list[Cell], of_kinds: list[Cell]
 ) -> list[int]:
     """Columns to refine: the best of every kind, and all probable ones."""
     weight = np.zeros(len(problem.columns))
     for cell in cells:
         weight[list(cell.columns)] += np.exp(cell.log_evidence - cells[0].log_evidence)
     whole = sum(np.exp(cell.log_evidence - cells[0].log_evidence) for cell in cells)
-    best = [k for k in _best_of_kinds(problem, alone) if alone[k] > cells[0].log_evidence - _COARSE]
-    counts = {*best, *np.flatnonzero(weight > _COUNTS * whole).tolist()}
+    least = cells[0].log_evidence - _COARSE
+    best = [cell for cell in of_kinds if cell.log_evidence > least]
+    counts = {*(cell.columns[0] for cell in best), *np.flatnonzero(weight > _COUNTS * whole).tolist()}
     return [k for k in sorted(counts) if problem.columns[k].widths]
 
 
-def _best_of_kinds(problem: Problem, alone: Float[np.ndarray, " column"]) -> list[int]:
+def _best_of_kinds(problem: Problem, alone: list[Cell]) -> list[Cell]:
     """The column of every kind that is most probable alone."""
-    best: dict[str, int] = {}
-    for k in np.argsort(-alone, kind="stable").tolist():
-        best.setdefault(problem.columns[k].kind, k)
+    best: dict[str, Cell] = {}
+    for cell in sorted(alone, key=lambda cell: -cell.log_evidence):
+        best.setdefault(problem.columns[cell.columns[0]].kind, cell)
     return list(best.values())
 
 
@@ -217,23 +232,28 @@ def _log_evidence_of_singles(problem: Problem) -> float:
     return float(logsumexp(np.concatenate(each)))
 
 
+def _alone(without: Cell, column: int, log_evidence: float) -> Cell:
+    return without._replace(log_evidence=float(log_evidence), columns=(int(column),))
+
+
 def _compared(
     problem: Problem, every: int = 1, reach: float = _LEAST
-) -> tuple[list[Cell], Float[np.ndarray, " column"]]:
-    """Relevant hypotheses, and ln evidence of every column alone with its best remainders.
+) -> tuple[list[Cell], list[Cell]]:
+    """Relevant hypotheses, and every column alone with its best remainders.
 
     With each `every`-th standard deviation of the remainders, and hypotheses within `reach` nats of
     the most probable one.
     """
     grid = _Grid.of(problem, every)
     cells: list[Cell] = []
-    alone = np.full(len(problem.columns), -np.inf)
+    alone: dict[int, Cell] = {}
     for none, value in grid.singles():
-        alone = np.maximum(alone, np.max(value, axis=0, initial=-np.inf))
         cells += none
         best = max(cell.log_evidence for cell in cells)
-        for one, k in np.argwhere(value > best - reach).tolist():
-            cells.append(none[one]._replace(log_evidence=float(value[one, k]), columns=(k,)))
+        for k, one in enumerate(np.argmax(value, axis=0).tolist()):
+            if k not in alone or value[one, k] > alone[k].log_evidence:
+                alone[k] = _alone(none[one], k, value[one, k])
+        cells += [_alone(none[n], k, value[n, k]) for n, k in np.argwhere(value > best - reach)]
     best = max(cell.log_evidence for cell in cells)
     prior = grid.own[0].prior_of_pairs()
     bounds = [0.0 if other is None else other.bound() for other in grid.higher]
@@ -253,7 +273,7 @@ def _compared(
             break
         best = max(cell.log_evidence for cell in some)
     kept = [cell for cell in cells if cell.log_evidence > best - reach]
-    return sorted(kept, key=lambda cell: -cell.log_evidence), alone
+    return sorted(kept, key=lambda cell: -cell.log_evidence), list(alone.values())
 
 
 def _with_one_more(cells: list[Cell], grid: _Grid, n_laws: int, least: float) -> list[Cell]:

@@ -12,7 +12,8 @@ from snrmjax.diagnose.naming.assessed import DRAWN, Assessed, Laws, classes_of
 from snrmjax.diagnose.naming.columns import parameters_of
 from snrmjax.diagnose.naming.rows import Cell, Problem, Solved, solved
 
-_CELLS = 100  # most probable hypotheses that are solved
+_CELLS = 100  # hypotheses that are solved, about
+_LEAST = 1e-3  # probability of laws of which at least one hypothesis is solved
 _NOT_NOISE = float(np.log(priors.NAMED / (1 - priors.NAMED)))  # ln odds of `NAMED`
 _DRAWS = 500  # samples of the explained fraction
 _POINTS = 60  # of a drawn remainder
@@ -97,13 +98,10 @@ _Negligible = tuple[np.ndarray, Callable[[np.ndarray], bool]]
 
 def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     """The answer by parts from the hypotheses of a test's readings."""
-    cells = cells[:_CELLS]
-    weight = np.exp([cell.log_evidence - cells[0].log_evidence for cell in cells])
-    weight = weight / weight.sum()
     negligible = {part: _negligible(problem, part) for part in problem.parts}
     assessed = [
-        _assessed(problem, cell, float(w), negligible)
-        for cell, w in zip(cells, weight, strict=True)
+        _assessed(problem, cell, weight, negligible)
+        for cell, weight in _representative(problem, cells)
     ]
     classes = {part: classes_of(assessed, part) for part in (*problem.parts, "instrument")}
     wanted = {kind for effects, _, _ in classes.values() for kind in effects}
@@ -133,6 +131,29 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
         natural_frequency=linear.natural_frequency + stiffness_error * linear.frequency_std,
         damping_ratio=linear.damping_ratio + damping_error * linear.damping_std,
     )
+
+
+def _representative(problem: Problem, cells: list[Cell]) -> list[tuple[Cell, float]]:
+    """Hypotheses to be solved, with probabilities that include those that are left out.
+
+    Laws with several shape parameters spread over many shapes, each of small probability. So each
+    set of laws keeps its probability, whatever the number of its shapes that are solved.
+    """
+    weight = np.exp([cell.log_evidence - cells[0].log_evidence for cell in cells])
+    weight = weight / weight.sum()
+    groups: dict[Any, list[int]] = {}
+    for k, cell in enumerate(cells):
+        kinds = tuple(sorted(problem.columns[c].kind for c in cell.columns))
+        groups.setdefault((kinds, *(std > 0 for std in cell.remainder_std)), []).append(k)
+    chosen = []
+    for group in groups.values():
+        whole = float(weight[group].sum())
+        if whole > _LEAST:
+            some = group[: max(1, round(_CELLS * whole))]
+            part = weight[some] * (whole / weight[some].sum())
+            chosen += [(cells[k], float(w)) for k, w in zip(some, part, strict=True)]
+    total = sum(w for _, w in chosen)
+    return sorted([(cell, w / total) for cell, w in chosen], key=lambda pair: -pair[1])
 
 
 def _answer(one: Assessed, parts: list[PartAnswer]) -> Laws:
@@ -338,9 +359,12 @@ def _explained(
             one.solved.mean, one.solved.covariance, size=times, method="eigh"
         )
         n_laws = len(one.cell.columns)
-        own = np.array([problem.columns[c].kind in named for c in one.cell.columns])
+        kinds = [problem.columns[c].kind for c in one.cell.columns]
+        own = np.array([kind in named for kind in kinds])
+        # What an instrument error does is no change of the structure, unless it is an alternative.
+        further = np.array([not hypothesis_of(kind).of_instrument for kind in kinds]) & ~own
         law = (draws[:, :n_laws] * own) @ change.of_law.T
-        other = (draws[:, :n_laws] * ~own) @ change.of_law.T
+        other = (draws[:, :n_laws] * further) @ change.of_law.T
         rest = draws[:, _rest(problem, one.cell, part)] @ change.functions.T + other
         spread = _rms_of if part not in DRAWN or _is_flat(law) else _std_of
         # Uncertainty along the law's own curve: its describing function, and remainder like it.

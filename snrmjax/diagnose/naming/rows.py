@@ -6,8 +6,8 @@ The blocks share only the laws. Each is orthogonalised once (QR) for all hypothe
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
-from scipy.linalg import block_diag, solve_triangular
+from jaxtyping import Bool, Complex, Float, Int
+from scipy.linalg import block_diag, cholesky, solve_triangular
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.naming.columns import Column
@@ -175,29 +175,59 @@ class Solved(NamedTuple):
 
 
 def solved(problem: Problem, cell: Cell) -> Solved:
-    """Posterior of a hypothesis, with N(0, 1) priors of strengths and of errors."""
+    """Posterior of a hypothesis, with N(0, 1) priors of strengths and of errors.
+
+    Block by block: errors and remainders are eliminated first, then the laws are solved for.
+    """
     laws, blocks = list(cell.columns), problem.blocks
-    design = block_diag(*(block.design for block in blocks))
-    design = np.hstack([np.vstack([block.laws[:, laws] for block in blocks]), design])
-    rows = np.concatenate([block.rows for block in blocks])
-    variances = [np.ones(len(laws))]  # strengths of laws are far smaller: a flat prior
-    kept, first = [np.ones(len(laws), bool)], 2
-    for index, block in enumerate(blocks):
-        stds = (
-            cell.remainder_std[:first]
-            if index == 0
-            else cell.remainder_std[first + index - 1 :][:1]
-        )
-        variances.append(block.variances(stds, cell.level_std))
-        kept.append(np.repeat([False, True], [block.groups[0], sum(block.groups[1:])]))
-    root, remain = np.sqrt(np.concatenate(variances)), np.concatenate(kept)
-    q, r = np.linalg.qr(np.vstack([design * root, np.eye(len(root))]))
-    inverse = root[:, None] * solve_triangular(r, np.eye(len(root)))
-    mean = inverse @ (q[: len(rows)].T @ rows)
-    left = (rows - design @ mean) ** 2
-    misfit = float(np.sqrt(np.mean(left)))
-    of_fundamentals = float(np.sqrt(np.mean(left[: len(blocks[0].rows)])))
-    # The first error is that of the modal mass.
-    linear = float(mean[len(laws) + 1]), float(mean[len(laws) + 2])
-    covariance = (inverse @ inverse.T)[np.ix_(remain, remain)]
-    return Solved(mean[remain], covariance, misfit, of_fundamentals, linear)
+    first, *further = blocks
+    own = first.variances(cell.remainder_std[:2], cell.level_std)
+    others = zip(further, cell.remainder_std[2:], strict=True)
+    eliminated = [_eliminated(first, own, laws)]
+    eliminated += [_eliminated(block, block.variances((std,)), laws) for block, std in others]
+    # Strengths of laws are far smaller than 1: a flat prior.
+    precision = np.eye(len(laws)) + sum(one.precision for one in eliminated)
+    of_laws = np.linalg.inv(precision)
+    strengths = of_laws @ sum(one.force for one in eliminated)
+    slopes = np.vstack([np.eye(len(laws)), *(-one.along_laws[one.remain] for one in eliminated)])
+    unknowns = [one.mean - one.along_laws @ strengths for one in eliminated]
+    mean = [unknown[one.remain] for one, unknown in zip(eliminated, unknowns, strict=True)]
+    own_covariance = [one.covariance[np.ix_(one.remain, one.remain)] for one in eliminated]
+    covariance = slopes @ of_laws @ slopes.T
+    covariance += block_diag(np.zeros((len(laws), len(laws))), *own_covariance)
+    left = [
+        (block.rows - block.laws[:, laws] @ strengths - block.design @ unknown) ** 2
+        for block, unknown in zip(blocks, unknowns, strict=True)
+    ]
+    return Solved(
+        np.concatenate([strengths, *mean]),
+        covariance,
+        misfit=float(np.sqrt(np.mean(np.concatenate(left)))),
+        of_fundamentals=float(np.sqrt(np.mean(left[0]))),
+        linear=(float(unknowns[0][1]), float(unknowns[0][2])),  # after that of the modal mass
+    )
+
+
+class _Eliminated(NamedTuple):
+    """Errors and remainders of a block for given laws, and what its rows say of the laws."""
+
+    precision: Float[np.ndarray, "law law"]
+    force: Float[np.ndarray, " law"]  # precision times strengths
+    mean: Float[np.ndarray, " unknown"]  # without laws
+    along_laws: Float[np.ndarray, "unknown law"]  # its decrease per strength
+    covariance: Float[np.ndarray, "unknown unknown"]  # with known laws
+    remain: Bool[np.ndarray, " unknown"]  # functions of the remainders
+
+
+def _eliminated(block: RowBlock, variances: np.ndarray, laws: list[int]) -> _Eliminated:
+    root, some = np.sqrt(variances), [*laws, -1]
+    scaled = block.triangle * root
+    across, along = block.across[np.ix_(some, some)], block.along[:, some]
+    factor = cholesky(scaled @ scaled.T + np.eye(len(scaled)), lower=True)
+    white = solve_triangular(factor, along, lower=True)
+    gram = across + white.T @ white
+    inverse = np.linalg.inv(scaled.T @ scaled + np.eye(len(root)))
+    gain = root[:, None] * (scaled.T @ solve_triangular(factor, white, lower=True, trans=1))
+    remain = np.repeat([False, True], [block.groups[0], sum(block.groups[1:])])
+    covariance = root[:, None] * inverse * root
+    return _Eliminated(gram[:-1, :-1], gram[:-1, -1], gain[:, -1], gain[:, :-1], covariance, remain)
