@@ -13,10 +13,11 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
-from snrmjax.diagnose.naming.hypotheses import best_hypotheses
+from snrmjax.diagnose.naming.columns import parameters_of
+from snrmjax.diagnose.naming.hypotheses import best_hypotheses, hypotheses_of
 from snrmjax.diagnose.naming.parts import Naming, naming_of
 from snrmjax.diagnose.naming.phases import likely_dynamic_stiffness
-from snrmjax.diagnose.naming.rows import Problem
+from snrmjax.diagnose.naming.rows import Cell, Problem, solved
 from snrmjax.diagnose.readings import (
     LinearTest,
     ModelMotion,
@@ -29,13 +30,17 @@ from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.identify.pointwise.snrm import is_single, linear_mode, participation_of, sensed_mode
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.effect_base import AbstractAddedMode
+from snrmjax.model.effect_base import AbstractAddedMode, AbstractForce
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.library.measurement_chain import ModeShapeChange
 from snrmjax.model.modes import linear_response, residual_velocity
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import padded
 
 _ANY_PHASE = 1.0  # rad, 1σ of an unrecorded phase about its estimate
+_PASSES = 2  # of harmonic balance at the strengths
+_BALANCED = 24  # columns that are made exact by harmonic balance
+_BY_HARMONICS = 0.04  # x³: its third harmonic is 1/24 of the motion per unit of stiffness change
 
 
 class NamedParts(NamedTuple):
@@ -55,7 +60,9 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     if unknown.any():
         predictions = _with_likely_phases(predictions, data)
     if unknown.any():
-        kinds = [k for k in kinds if not issubclass(EFFECTS[k], AbstractAddedMode | ModeShapeChange)]
+        kinds = [
+            k for k in kinds if not issubclass(EFFECTS[k], AbstractAddedMode | ModeShapeChange)
+        ]
     elif not (predictions.chosen.orders or predictions.given.potential.monomials):
         kinds = [k for k in kinds if not issubclass(EFFECTS[k], ModeShapeChange)]
     readings = _readings(predictions, data, unknown)
@@ -68,7 +75,70 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
     if phase > priors.OF_LEVELS * priors.INSTRUMENT_PHASE:
         kinds = [k for k in kinds if not hypothesis_of(k).only_phase]
     problem, cells = best_hypotheses(readings, kinds)
+    for _ in range(0 if unknown.any() else _PASSES):
+        balanced = _with_balanced_laws(problem, cells, predictions, data)
+        if balanced is None:
+            break
+        problem, cells = balanced, hypotheses_of(balanced)
     return NamedParts(naming_of(problem, cells), problem)
+
+
+def _with_balanced_laws(
+    problem: Problem, cells: list[Cell], predictions: Predictions, data: SteadyStates
+) -> Problem | None:
+    """The problem with strong laws as harmonic balance has them; None without strong laws.
+
+    A law excites harmonics of the motion, which change its force at the fundamental: by about
+    θ²/25 of the linear stiffness for a law that changes it by θ. The columns of the most probable
+    hypotheses become exact for their strengths in these.
+    """
+    readings, unit = problem.readings, problem.readings.natural_frequency**2
+    laws: dict[int, tuple[dict[str, float], float]] = {}  # parameters and strengths, by column
+    strong = False
+    for cell in cells:
+        own = [
+            k for k in cell.columns if issubclass(EFFECTS[problem.columns[k].kind], AbstractForce)
+        ]
+        if len(laws) >= _BALANCED or {*own} <= laws.keys():
+            continue
+        mean = solved(problem, cell).mean
+        for k in own:
+            column, strength = problem.columns[k], float(mean[cell.columns.index(k)])
+            low, high = column.limits
+            parameters = (
+                parameters_of(readings, column, strength) if low < strength < high else None
+            )
+            if k in laws or not parameters:
+                continue
+            laws[k] = {f"{column.kind}.{name}": v for name, v in parameters.items()}, strength
+            error = readings.whitened(_BY_HARMONICS * strength**2 * unit * column.change)
+            strong |= bool(np.linalg.norm(error) > priors.VISIBLE)
+    if not strong:
+        return None
+    changes = _balanced_changes(readings, predictions, data, [law for law, _ in laws.values()])
+    exact = {
+        k: problem.columns[k]._replace(change=change / (strength * unit), widths=())
+        for (k, (_, strength)), change in zip(laws.items(), changes, strict=True)
+        if np.isfinite(change).all()
+    }
+    kinds = {column.kind for column in exact.values()}
+    others = [column for column in problem.columns if column.kind not in kinds]
+    return problem.with_columns([*exact.values(), *others])
+
+
+def _balanced_changes(
+    readings: Readings,
+    predictions: Predictions,
+    data: SteadyStates,
+    laws: list[dict[str, float]],
+) -> Complex[np.ndarray, "law state"]:
+    """Change of the dynamic stiffness (1/s²) by every law, at the measured fundamental motions."""
+    motion = _PrescribedMotion.of(predictions, data, readings.velocity, readings.frequency)
+    there = motion.predictions({label.split(".")[0] for law in laws for label in law})
+    group = there.group
+    values = [group.at(tuple(law), np.array(list(law.values()))) for law in laws]
+    stiffness = motion.dynamic_stiffness(there.of(np.array([group.values, *values])).columns)
+    return stiffness[1:] - stiffness[0]
 
 
 def _shows_at_one_phase(kind: str) -> bool:
@@ -90,7 +160,7 @@ def _with_likely_phases(predictions: Predictions, data: SteadyStates) -> Predict
     rows = np.arange(len(chosen.rows))
     states = test_states_of(predictions, rows)
     amplitude = np.abs(states.velocity) / states.frequency
-    model = _motion_of_model(predictions, data, rows, ())(states.velocity, states.frequency)
+    model = _motion_of_model(predictions, data, ())(states.velocity, states.frequency)
     natural = float(linear_mode(modes)[0])
     z = likely_dynamic_stiffness(
         states.force * states.constant / amplitude, model.dynamic_stiffness[0], amplitude, natural
@@ -138,7 +208,7 @@ def _readings(predictions: Predictions, data: SteadyStates, unknown: np.ndarray)
     # The phases of harmonics are relative to the fundamental, whose phase must be known.
     no_harmonics = bool(unknown.any()) or not is_single(modes)
     recorded = _recorded_harmonics(predictions, rows, none=no_harmonics)
-    model = _motion_of_model(predictions, data, rows, recorded.order)
+    model = _motion_of_model(predictions, data, recorded.order)
     return readings_of(states, order, model, linear, recorded, phases_known=not unknown.any())
 
 
@@ -164,32 +234,32 @@ def _recorded_harmonics(
     return RecordedHarmonics(orders, velocity, np.where(known, std, np.nan), forced)
 
 
-def _motion_of_model(
-    predictions: Predictions, data: SteadyStates, rows: np.ndarray, orders: tuple[int, ...]
-) -> MotionOfModel:
-    """The model's motion: in closed form for a linear mode, else by harmonic balance."""
-    model = predictions.given
-    modes, sensor = model.modes, predictions.chosen.sensors[0]
-    j = modes.mode_of_interest
-    natural, ratio = map(float, linear_mode(modes))
-    if not (model.effects or model.potential.monomials):
+class _PrescribedMotion(NamedTuple):
+    """Measured states with other motions of the mode at the reference sensor."""
 
-        def linear(velocity: Complex[np.ndarray, " state"], omega: np.ndarray) -> ModelMotion:
-            none = np.zeros((1, len(omega), len(orders)), complex)
-            return ModelMotion((natural**2 - omega**2 + 2j * ratio * natural * omega)[None], none)
+    model: Structure
+    data: SteadyStates
+    mode: Complex[np.ndarray, " state"]  # velocity of the mode at the sensor, m/s
+    frequency: Float[np.ndarray, " state"]  # rad/s
+    force: Float[np.ndarray, " state"]  # N
+    residual: Complex[np.ndarray, " state"]  # velocity of residual modes per unit of force
+    driven: Complex[np.ndarray, " state"]  # velocity of the mode per unit of force and iΩ/Z
 
-        return linear
-    constant = modes.mode_shape.item(sensor, j) * float(participation_of(modes))
-    used = predictions.chosen.rows[rows]
-    # Errors of linear parameters have columns of their own.
-    names = [name for name in predictions.stated if not name.startswith("mode_")]
-    stds = np.array([predictions.stated[name][1] for name in names])
-
-    def balanced(
-        velocity: Complex[np.ndarray, " state"], omega: Float[np.ndarray, " state"]
-    ) -> ModelMotion:
+    @classmethod
+    def of(
+        cls,
+        predictions: Predictions,
+        data: SteadyStates,
+        velocity: Complex[np.ndarray, " state"],
+        omega: Float[np.ndarray, " state"],
+    ) -> "_PrescribedMotion":
+        """For velocities (m/s) of the mode alone."""
+        model, chosen = predictions.given, predictions.chosen
+        modes, sensor, used = model.modes, chosen.sensors[0], chosen.rows
+        constant = modes.mode_shape.item(sensor, modes.mode_of_interest)
+        constant = constant * float(participation_of(modes))
         sensed = sensed_mode(modes, omega)
-        to_mode, driven = np.asarray(sensed.to_mode(sensor)), constant * np.asarray(sensed.ratio)
+        to_mode = np.asarray(sensed.to_mode(sensor))
         own = np.sign(constant) * velocity / to_mode
         force = np.asarray(data.force)[used]
         rest = np.asarray(residual_velocity(modes, *map(jnp.asarray, (omega, np.ones_like(force)))))
@@ -197,19 +267,54 @@ def _motion_of_model(
         recorded[used, sensor] = own + rest[:, sensor] * force
         known = jnp.asarray(recorded), jnp.zeros_like(data.phase_std)
         prescribed = eqx.tree_at(lambda d: (d.velocity, d.phase_std), data, known)
-        there = predictions_of(model, prescribed, kinds=())
+        driven = constant * np.asarray(sensed.ratio) / to_mode
+        return cls(model, prescribed, own, omega, force, rest[:, sensor], driven)
+
+    def predictions(self, kinds: Iterable[str]) -> Predictions:
+        """Force and harmonics that these motions need, with further effects."""
+        return predictions_of(self.model, self.data, kinds=[k for k in EFFECTS if k in {*kinds}])
+
+    def dynamic_stiffness(
+        self, columns: Float[np.ndarray, "*trial state column"]
+    ) -> Complex[np.ndarray, "*trial state"]:
+        """Z = FA/X of the mode, 1/s², for the force that the motions need."""
+        needed = self.force * (1 + columns[..., 0] + 1j * columns[..., 1])
+        # Residual modes respond to the force that the model needs, not to the measured one.
+        mode = self.mode + self.residual * (self.force - needed)
+        with np.errstate(invalid="ignore"):  # NaN where the model has no such motion
+            return 1j * self.frequency * self.driven * needed / mode
+
+
+def _motion_of_model(
+    predictions: Predictions, data: SteadyStates, orders: tuple[int, ...]
+) -> MotionOfModel:
+    """The model's motion: in closed form for a linear mode, else by harmonic balance."""
+    model = predictions.given
+    natural, ratio = map(float, linear_mode(model.modes))
+    if not (model.effects or model.potential.monomials):
+
+        def linear(velocity: Complex[np.ndarray, " state"], omega: np.ndarray) -> ModelMotion:
+            none = np.zeros((1, len(omega), len(orders)), complex)
+            return ModelMotion((natural**2 - omega**2 + 2j * ratio * natural * omega)[None], none)
+
+        return linear
+    # Errors of linear parameters have columns of their own.
+    names = [name for name in predictions.stated if not name.startswith("mode_")]
+    stds = np.array([predictions.stated[name][1] for name in names])
+
+    def balanced(
+        velocity: Complex[np.ndarray, " state"], omega: Float[np.ndarray, " state"]
+    ) -> ModelMotion:
+        motion = _PrescribedMotion.of(predictions, data, velocity, omega)
+        there = motion.predictions(())
         predicted = there.of(there.group.values[None], names)
-        columns = np.moveaxis(predicted.slopes[0] * stds, 2, 0) + predicted.columns[0]
-        parts = np.concatenate([predicted.columns, columns])
-        parts = parts[..., 0::2] + 1j * parts[..., 1::2]
+        shifted = np.moveaxis(predicted.slopes[0] * stds, 2, 0) + predicted.columns[0]
+        columns = np.concatenate([predicted.columns, shifted])
         chosen = there.chosen
         speed, n = np.abs(np.asarray(chosen.states.velocity)[:, :1]), len(chosen.sensors)
         measured = np.asarray(chosen.states.harmonics)[:, 0]
+        parts = columns[..., 0::2] + 1j * columns[..., 1::2]
         higher = (measured + parts[:, :, n : n + len(chosen.orders)] * speed)[..., : len(orders)]
-        needed = force * (1 + parts[:, :, 0])
-        # Residual modes respond to the force that the model needs, not to the measured one.
-        mode = own + rest[:, sensor] * (force - needed)
-        with np.errstate(invalid="ignore"):  # NaN where the model has no such motion
-            return ModelMotion(1j * omega * driven * needed / (mode * to_mode), higher)
+        return ModelMotion(motion.dynamic_stiffness(columns), higher)
 
     return balanced

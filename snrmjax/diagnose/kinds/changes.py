@@ -16,7 +16,7 @@ from snrmjax.numerics.units import HERTZ
 
 # Over the largest amplitude; fine enough that neighbouring values show a corner between them.
 GAPS = np.linspace(0.04, 0.96, 47)
-STIFFNESSES = np.log([0.2, 2.0, 20.0])  # ln, of a stop, over ω₀²
+STIFFNESSES = np.log([0.02, 0.2, 2.0, 20.0])  # ln, of a stop, over ω₀²
 # ln, over ω₀² and the largest amplitude
 QUADRATICS = np.log([0.003, 0.008, 0.02, 0.05, 0.12, 0.3])
 BILINEARS = np.log([0.003, 0.01, 0.03, 0.1, 0.3])  # ln, over ω₀²

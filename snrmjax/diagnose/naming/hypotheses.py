@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
@@ -160,9 +160,7 @@ def _with_likeliest_length(readings: Readings, columns: list[Column]) -> Problem
     return max(problems, key=_log_evidence_of_singles)
 
 
-def _worth_dividing(
-    problem: Problem, cells: list[Cell], of_kinds: list[Cell]
-) -> list[int]:
+def _worth_dividing(problem: Problem, cells: list[Cell], of_kinds: list[Cell]) -> list[int]:
     """Columns to refine: the best of every kind, and all probable ones."""
     weight = np.zeros(len(problem.columns))
     for cell in cells:
@@ -170,7 +168,10 @@ def _worth_dividing(
     whole = sum(np.exp(cell.log_evidence - cells[0].log_evidence) for cell in cells)
     least = cells[0].log_evidence - _COARSE
     best = [cell for cell in of_kinds if cell.log_evidence > least]
-    counts = {*(cell.columns[0] for cell in best), *np.flatnonzero(weight > _COUNTS * whole).tolist()}
+    counts = {
+        *(cell.columns[0] for cell in best),
+        *np.flatnonzero(weight > _COUNTS * whole).tolist(),
+    }
     return [k for k in sorted(counts) if problem.columns[k].widths]
 
 
