@@ -316,6 +316,34 @@ def test_the_fraction_of_a_law_is_right_with_another_power_of_the_amplitude(powe
     assert part.explained.high - part.explained.low < 0.55
 
 
+def test_a_drift_of_the_test_is_no_part_of_what_a_law_explains():
+    """A drift as large as the law's own change is an error of the instrument."""
+    read = readings(lambda x: 0.02 * x**2, nothing)
+    drifted = read.whitened(0.02 * read.order * read.natural_frequency**2 + 0j)
+    read = read._replace(rows=read.rows + drifted)
+    kinds = ("cubic_stiffness", "quintic_stiffness", "frequency_drift")
+    found = parts.naming_of(*hypotheses.best_hypotheses(read, kinds))
+    stiffness, *_, instrument = found.parts
+    assert (stiffness.effects, instrument.effects) == (("cubic_stiffness",), ("frequency_drift",))
+    assert stiffness.verdict == "named"
+    assert stiffness.explained.value > 0.95
+
+
+def test_laws_of_many_shapes_keep_their_probability():
+    """300 gaps with half of the probability together, and a spring with the other half."""
+    read = readings(lambda x: 0.02 * x**2, nothing)
+    columns = hypothesis_columns(read, ["gap_stiffness", "cubic_stiffness"])
+    problem = problem_of(read, columns, 1.0)
+    (spring,) = (k for k, column in enumerate(columns) if column.kind == "cubic_stiffness")
+    gaps = [k for k in range(len(columns)) if k != spring]
+    cells = [Cell(np.log(300.0), (spring,), (0.0, 0.0))]
+    cells += [Cell(0.0, (gaps[k % len(gaps)],), (0.0, 0.0)) for k in range(300)]
+    chosen = parts._representative(problem, cells)
+    assert len(chosen) < 150
+    assert sum(w for cell, w in chosen if cell.columns == (spring,)) == pytest.approx(0.5)
+    assert sum(w for cell, w in chosen if cell.columns != (spring,)) == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize(
     ("fraction", "with_a_rest", "with_noise"),
     [
