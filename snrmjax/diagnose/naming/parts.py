@@ -108,7 +108,11 @@ def naming_of(problem: Problem, cells: list[Cell]) -> Naming:
     with_all = [
         one for one in assessed if wanted <= {k for some in one.laws.values() for k in some}
     ]
-    best = max(with_all or assessed, key=lambda one: one.weight)
+    # Laws that are not named would be missing in the completed model.
+    no_other = [
+        one for one in with_all if wanted >= {problem.columns[c].kind for c in one.cell.columns}
+    ]
+    best = max(no_other or with_all or assessed, key=lambda one: one.weight)
     parts = [_part(problem, assessed, part, best, classes[part]) for part in classes]
     nothing = sum(one.weight for one in assessed if one.changes_nothing)
     if nothing < 0.5 and all(part.verdict == "none" for part in parts):
