@@ -19,6 +19,7 @@ GAPS = np.linspace(0.04, 0.96, 47)
 STIFFNESSES = np.log([0.02, 0.2, 2.0, 20.0])  # ln, of a stop, over ω₀²
 # ln, over ω₀² and the largest amplitude
 QUADRATICS = np.log([0.003, 0.008, 0.02, 0.05, 0.12, 0.3])
+PRELOADS = np.log([0.02, 0.06, 0.2, 0.6])  # ln, static displacement over the largest amplitude
 BILINEARS = np.log([0.003, 0.01, 0.03, 0.1, 0.3])  # ln, over ω₀²
 SLIPS = np.linspace(np.log(0.02), np.log(0.95), 47)  # ln, over the largest amplitude
 EXPONENTS = np.linspace(1.1, 2.9, 10)
@@ -83,6 +84,35 @@ def bilinear_change(r: Readings, log_k: float) -> tuple[np.ndarray, np.ndarray]:
     k = np.exp(log_k)
     twice = 2 * k / (3 * np.pi) * np.ones_like(r.dynamic_stiffness)
     return -2 * (k / np.pi) ** 2 + twice**2 / (4 * r.relative_frequency**2 - 1), twice
+
+
+def preload_change(r: Readings, log_static: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of a static displacement q₀ on the model's own cubic force γ q³, and the second harmonic.
+
+    About q₀ that force is γ q₀³ + 3γ q₀² q + 3γ q₀ q² + γ q³.
+    """
+    static = np.exp(log_static)
+    square = 3 * cubic_of_model(r) * static  # of a force square × q²
+    if square == 0:
+        return 0 * r.dynamic_stiffness, 0 * r.dynamic_stiffness
+    x, omega = r.relative_amplitude, r.relative_frequency
+    change, twice = describing.quadratic(x, omega, r.damping_ratio, abs(square))
+    return square * static + change, np.sign(square) * twice
+
+
+def preload(r: Readings, strength: float, log_static: float, side: float) -> tuple[float]:
+    """The constant force that displaces the mode, at a strength that goes with its square."""
+    static = side * np.exp(log_static) * np.sqrt(max(strength, 0.0))
+    force = static + cubic_of_model(r) * static**3
+    return (float(-force * r.natural_frequency**2 * r.largest),)
+
+
+def cubic_of_model(r: Readings) -> float:
+    """γ over ω₀² for the largest amplitude 1, where the model's stiffness is that of γ q³."""
+    stiffness = r.model.value.real / r.natural_frequency**2
+    stiffness = stiffness - stiffness[r.model.logs == 0]
+    unit = 0.75 * np.expm1(2 * r.model.logs)[:, None] * r.relative_amplitude**2
+    return float(np.sum(unit * stiffness) / np.sum(unit**2))
 
 
 def second_harmonic_of(law: Callable[[Readings, float], tuple[np.ndarray, np.ndarray]]) -> Change:

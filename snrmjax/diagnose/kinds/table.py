@@ -232,9 +232,14 @@ HYPOTHESES: dict[str, Hypothesis] = {
     ),
     stiffness.StaticPreload.kind: Hypothesis(
         # Without effect on a linear structure; with a cubic spring it acts like a quadratic one.
+        lambda r, log_static, _: changes.preload_change(r, log_static)[0],
+        changes.second_harmonic_of(changes.preload_change),
+        axes=(changes.PRELOADS,),
+        choices=(1.0, -1.0),
+        sign=1,
+        parameters=changes.preload,
         starts=starts.of_preload,
         confounders=(confounders.SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,),
-        searched=False,
     ),
 }
 """By kind: every effect of the library, and those that `register_hypothesis` adds."""
