@@ -7,8 +7,7 @@ import numpy as np
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.residuals import scatter_of_levels
-from snrmjax.diagnose.diagnosis_result import Diagnosis, Estimate, completed_model
-from snrmjax.diagnose.drawn_law import DrawnLaw
+from snrmjax.diagnose.diagnosis_result import Diagnosis, DrawnLaw, Estimate, completed_model
 from snrmjax.diagnose.explained_parts import NamedParts, overall
 from snrmjax.diagnose.fitted_effects import FittedEffects, TriedEffect, refined
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
@@ -22,7 +21,6 @@ from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.verdict import Kinds, Verdict, answer_of
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.effects import EFFECTS, is_own
 from snrmjax.model.library.free_laws import StiffnessLaw
 from snrmjax.model.structures import Structure
@@ -237,14 +235,4 @@ def _drawn(named: NamedParts, part: str, remainder: Remainder) -> DrawnLaw:
         force, name = np.asarray(law.coefficient) * passing / shape, "displacement_damping"
     largest = readings.largest * shape
     std = relative * np.max(np.abs(force)) * np.ones_like(force)
-    return DrawnLaw(
-        name,
-        ("odd",),
-        (),
-        Argument.DISPLACEMENT,
-        at * shape,
-        force / shape,
-        std / shape,
-        largest=largest,
-        passing=passing,
-    )
+    return DrawnLaw(name, at * shape, force / shape, std / shape, largest, passing)

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.residuals import WithheldLevel
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
-from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.fitted_effects import TriedEffect
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.assessed import DRAWN
@@ -71,6 +70,28 @@ class Estimate(NamedTuple):
 
     value: float
     std: float  # 1σ
+
+
+class DrawnLaw(NamedTuple):
+    """A remainder as an equivalent force at the reference sensor, for lack of a library law.
+
+    `at` is the displacement (m) of that sensor; `force` (N), with its 1σ, is that of a spring or a
+    damper between the sensor's point and the ground, in addition to the linear model. With the mode
+    shape φ at the sensor x = φq, and φ times the force is the modal force. For damping it is the
+    force at the velocity `passing`.
+    """
+
+    law: str  # "spring" or "displacement_damping"
+    at: Float[np.ndarray, " knot"]
+    force: Float[np.ndarray, " knot"]
+    force_std: Float[np.ndarray, " knot"]
+    largest: float  # measured value of `at`; beyond it the law is extrapolated
+    passing: float | None = None  # m/s
+
+    @property
+    def name(self) -> str:
+        """Its class in words."""
+        return str(Fact("law_class", law=self.law))
 
 
 class Answer(NamedTuple):
