@@ -260,12 +260,7 @@ class Diagnosis(AbstractResult):
         """See `AbstractResult`."""
         tried = [(number + 1, row) for number, step in enumerate(self.table) for row in step]
         rows = [row for _, row in tried]
-        powers = [
-            (np.nan, np.nan) if p.exponent is None else (p.exponent, p.exponent_std)
-            for p in self.located
-        ]
         ranges = np.array([p.velocity_range for p in self.located]).reshape(-1, 2)
-        exponent = np.array(powers, dtype=float).reshape(-1, 2)
         names = list(self.parameters)
         columns = {
             "candidate": (_texts(row.kind for row in rows), "", "effect compared"),
@@ -277,14 +272,12 @@ class Diagnosis(AbstractResult):
             "velocity_low_m_s": (ranges[:, 0], "m/s", "lowest velocity affected"),
             "velocity_high_m_s": (ranges[:, 1], "m/s", "highest velocity affected"),
             "p_value": ([p.p_value for p in self.located], "1", "p-value"),
-            "exponent": (exponent[:, 0], "1", "power of amplitude"),
-            "exponent_std": (exponent[:, 1], "1", "1σ of the power"),
             "parameter": (_texts(names), "", "parameter of an effect"),
             "value": ([p.value for p in self.parameters.values()], "unit", "in `unit`"),
             "value_std": ([p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"),
             "unit": (_texts(map(unit_of, names)), "", "of the value"),
         }
-        of = np.repeat(self.coordinates, (5, 6, 4)).tolist()
+        of = np.repeat(self.coordinates, (5, 4, 4)).tolist()
         return {
             name: Variable((dimension,), *column)
             for dimension, (name, column) in zip(of, columns.items(), strict=True)

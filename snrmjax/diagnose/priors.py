@@ -108,9 +108,6 @@ force, the close mode could explain the whole response."""
 OTHER_MODE = 0.1
 """Relative shift of a natural frequency that exceeds any error of a linear test."""
 
-SEEN_POWER = 16.0
-"""χ² that a power law of amplitude must explain to be reported: 4σ."""
-
 BEYOND_DATA = 10.0
 """Multiple of all that was measured beyond which an effect counts as undetectable."""
 

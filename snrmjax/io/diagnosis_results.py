@@ -161,14 +161,11 @@ def _by_part(part: PartAnswer) -> dict:
 
 
 def _part(part: Located) -> dict:
-    entry = {
+    return {
         "part": part.part,
         "velocity_range_m_s": list(part.velocity_range),
         "p_value": part.p_value,
     }
-    if part.exponent is not None:
-        entry |= {"exponent": part.exponent, "exponent_std": part.exponent_std}
-    return entry
 
 
 def summarise_localisation(localisation: Localisation) -> dict:

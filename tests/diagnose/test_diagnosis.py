@@ -271,8 +271,6 @@ def test_a_phase_error_is_not_taken_for_a_mode_close_by():
 def test_what_is_located_is_what_was_changed():
     found = sj.diagnose_model(linear_model(), balanced(lambda v: 8.0 * v))
     assert [part.part for part in found.located] == ["damping"]
-    (part,) = found.located
-    assert abs(part.exponent - 1.0) < 3 * part.exponent_std
     assert "quadratic_damping" in found.candidates[0]
 
 

@@ -48,7 +48,6 @@ from snrmjax.report.html import (
     Section,
     minus,
     number,
-    with_error,
     write_report,
 )
 from snrmjax.report.pages.resonance_table import resonance_in_words, resonance_rows, velocity_unit
@@ -349,7 +348,7 @@ def _comparison_section(
             ReportTable(header, resonance_rows(predicted, diagnosis.data.force_unit), caption)
         )
     figures = [shown[name] for name in ("parts", "responses", "residuals") if name in shown]
-    text = [_located(part, diagnosis.gap.after) for part in diagnosis.located]
+    text = [_located(part) for part in diagnosis.located]
     if not text:
         text = ["No part of the force balance differs from the model by more than the noise."]
     return Section("Model and data, before and after", text, figures, tables)
@@ -430,18 +429,11 @@ _PARTS = {
 }
 
 
-def _located(part: Located, misfit: float = 1.0) -> str:
-    """One part of the disagreement as a sentence.
-
-    The 1σ of its power of amplitude is widened by the remaining misfit, in units of noise.
-    """
+def _located(part: Located) -> str:
+    """One part of the disagreement as a sentence."""
     unit = unit_for(part.velocity_range, "m/s")
     low, high = (f"{one / unit.size:.3g}" for one in part.velocity_range)
     small = part.p_value < _LEAST_P_VALUE
     chance = "below 10⁻¹²" if small else number(part.p_value, 1)
-    text = f"{_PARTS[part.part]}, at velocity amplitudes from {low} to {high} {unit.name}"
-    if part.exponent is not None:
-        power = with_error(part.exponent, (part.exponent_std or 0.0) * max(1.0, misfit))
-        how = "grows" if part.exponent > 0 else "falls"
-        text += f"; the change {how} as amplitude^({power})"
-    return f"{text} (by chance: {chance})."
+    where = f"at velocity amplitudes from {low} to {high} {unit.name}"
+    return f"{_PARTS[part.part]}, {where} (by chance: {chance})."

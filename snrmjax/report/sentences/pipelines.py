@@ -115,9 +115,6 @@ def _by_import(advice: object, commands: tuple[str, ...]) -> str:
 
 
 SENTENCES: dict[str, Wording] = {
-    "outlying_left_out": (
-        "{n:#state} far from the single-mode curves left out of the diagnosis (see the backbone)."
-    ),
     "advice_by_import": _by_import,
     "advice_at_once": "{names} together: {command}. Separately, {alone}",
     "load": _load,
