@@ -130,9 +130,8 @@ for part in found.located:
 #   second mode at all.
 
 # %%
-# Bars: how much of the misfit each effect explains by itself; the residual receptance leads with
-# five times the next, an error of gain.
-plot.candidates_figure(found)
+# What changes with the amplitude, and what laws and remainder explain of it.
+plot.parts_figure(found)
 
 # %% [markdown]
 # ## 4. The completed model, and withheld levels

@@ -9,7 +9,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.residuals import scatter_of_levels
 from snrmjax.diagnose.diagnosis_result import Diagnosis, DrawnLaw, Estimate, completed_model
 from snrmjax.diagnose.explained_parts import NamedParts, overall
-from snrmjax.diagnose.fitted_effects import FittedEffects, TriedEffect, refined
+from snrmjax.diagnose.fitted_effects import FittedEffects, refined
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit, fit_effect
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
@@ -124,9 +124,7 @@ def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates
     tried = {*fit.kinds, *(kind for one in rivals for kind in one.kinds)}
     for kind in sorted(_own_kinds(named) - tried):
         rivals.append(_fitted(misfit, named.naming, [kind]))  # always fit the user's own effects
-    baseline = baseline_fit(misfit)
-    rows = tuple(_tried(baseline, one) for one in (fit, *rivals) if one.kinds)
-    return FittedEffects(misfit, fit, baseline, (rows,), groups)
+    return FittedEffects(misfit, fit, baseline_fit(misfit), tuple(rivals), groups)
 
 
 def _fitted(misfit: WeightedMisfit, naming: Naming, effects: Iterable[str]) -> EffectFit:
@@ -139,17 +137,6 @@ def _fitted(misfit: WeightedMisfit, naming: Naming, effects: Iterable[str]) -> E
             start = start._replace(starts=(first, *start.starts[:1]))
         fit = fit_effect(misfit, start, fit if fit.kinds else None)
     return fit
-
-
-def _tried(baseline: EffectFit, fit: EffectFit) -> TriedEffect:
-    """A fit with its gain over the given model."""
-    return TriedEffect(
-        fit.kinds[-1],
-        baseline.criterion - fit.criterion,
-        fit.chi_square,
-        dict(zip(fit.labels, fit.values.tolist(), strict=True)),
-        fit.status,
-    )
 
 
 def completed_by_parts(

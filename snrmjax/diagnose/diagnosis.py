@@ -140,7 +140,7 @@ def diagnose_model(
         discriminating_test=test,
         located=checked.located,
         gap=Gap(before, after, *(checked.levels or (None, None))),
-        checks=Checks(fitted.p_value, float(np.sqrt(checked.neighbours)), completed.without),
+        checks=Checks(fit.p_value, float(np.sqrt(checked.neighbours)), completed.without),
         detection_limits=detection_limits(named.problem, naming, excluded),
         table=fitted.table,
         notes=tuple(notes),
@@ -306,8 +306,8 @@ def _notes_on_answer(checked: _Checked, completed: _Completed) -> Iterator[Fact]
         yield Fact("not_physical_without", levels=completed.refused)
     if not (fit.status.found_minimum or fit.status is MinimisationStatus.NOT_FITTED):
         yield Fact("answer_not_converged")
-    rows = [row for step in checked.fitted.table for row in step]
-    lost = {row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE}
+    tried = checked.fitted.table
+    lost = {row.kind for row in tried if row.status is MinimisationStatus.NOT_FINITE}
     if lost:
         yield Fact("effects_not_fitted", effects=tuple(sorted(lost)))
 

@@ -155,7 +155,7 @@ class Diagnosis(AbstractResult):
     gap: Gap
     checks: Checks
     detection_limits: dict[str, float]
-    table: tuple[tuple[TriedEffect, ...], ...]  # effects compared, by step of the search
+    table: tuple[TriedEffect, ...]  # effects compared, the answer first
     notes: tuple[Fact | str, ...]
     force_misfit: ForceMisfit
     data: SteadyStates  # as compared: in N, also where a drive voltage was given
@@ -258,13 +258,11 @@ class Diagnosis(AbstractResult):
 
     def variables(self) -> Mapping[str, Variable]:
         """See `AbstractResult`."""
-        tried = [(number + 1, row) for number, step in enumerate(self.table) for row in step]
-        rows = [row for _, row in tried]
+        rows = self.table
         ranges = np.array([p.velocity_range for p in self.located]).reshape(-1, 2)
         names = list(self.parameters)
         columns = {
             "candidate": (_texts(row.kind for row in rows), "", "effect compared"),
-            "step": ([number for number, _ in tried], "1", "step of the search"),
             "gain": ([r.gain for r in rows], "1", "decrease of Schwarz's criterion"),
             "chi_square": ([r.chi_square for r in rows], "1", "remaining χ²"),
             "fit_status": (_texts(r.status.value for r in rows), "", "status of the fit"),
@@ -277,7 +275,7 @@ class Diagnosis(AbstractResult):
             "value_std": ([p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"),
             "unit": (_texts(map(unit_of, names)), "", "of the value"),
         }
-        of = np.repeat(self.coordinates, (5, 4, 4)).tolist()
+        of = np.repeat(self.coordinates, (4, 4, 4)).tolist()
         return {
             name: Variable((dimension,), *column)
             for dimension, (name, column) in zip(of, columns.items(), strict=True)

@@ -85,17 +85,14 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
             for row in predicted
         ],
         "tried": [
-            [
-                {
-                    "effect": row.kind,
-                    "gain": row.gain if math.isfinite(row.gain) else None,
-                    "chi_square": row.chi_square if math.isfinite(row.chi_square) else None,
-                    "parameters": row.parameters,
-                    "status": row.status.value,
-                }
-                for row in step
-            ]
-            for step in diagnosis.table
+            {
+                "effect": row.kind,
+                "gain": row.gain if math.isfinite(row.gain) else None,
+                "chi_square": row.chi_square if math.isfinite(row.chi_square) else None,
+                "parameters": row.parameters,
+                "status": row.status.value,
+            }
+            for row in diagnosis.table
         ],
     }
 

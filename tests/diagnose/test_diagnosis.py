@@ -243,7 +243,7 @@ def test_laws_in_addition_to_a_mode_close_by_are_chosen_anew():
     # From the fundamental, softening is the one or the other.
     softening = found.candidates[0]
     assert {"cubic_stiffness", "quadratic_stiffness"} <= set(softening)
-    rows = {row.kind: row for row in found.table[-1]}
+    rows = {row.kind: row for row in found.table}
     assert set(softening) <= set(rows)
     for kind in softening:
         names = {label.partition(".")[0] for label in rows[kind].parameters}

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgba
 from truths.printed_page import unreadable
 
 import snrmjax as sj
@@ -25,11 +24,6 @@ from snrmjax.report.pages import diagnosis as diagnosis_page
 
 SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 100.0, 0.01
 LARGEST = 0.6  # m/s
-TRIED = (
-    ("internal_resonance_1_2", 900.0),
-    ("cubic_stiffness", 800.0),
-    ("quintic_stiffness", 799.0),
-)
 BLIND = Path(__file__).parents[1] / "diagnose" / "blind"
 
 
@@ -54,23 +48,6 @@ def curves(effect, states):
     (axes,) = plot.effect_laws_figure(model(effect), states).axes
     lines = [line for line in axes.lines if len(line.get_xdata()) > 2]
     return axes, [(np.asarray(x), np.asarray(y)) for x, y in (line.get_data() for line in lines)]
-
-
-def test_what_was_considered_has_the_colour_of_the_answer_only_where_it_is_the_answer():
-    """Two effects together explain more than the one that is the best by itself."""
-    tried = [SimpleNamespace(kind=kind, gain=gain) for kind, gain in TRIED]
-    answer = (("cubic_stiffness", "quintic_stiffness"), ("quadratic_damping",))
-    (axes,) = plot.candidates_figure(
-        SimpleNamespace(table=[tried], candidates=answer)  # type: ignore[arg-type]
-    ).axes
-    names = [one.get_text() for one in axes.get_yticklabels()]
-    marked = [
-        name
-        for name, bar in zip(names, axes.patches, strict=True)
-        if bar.get_facecolor() == to_rgba(drawing.IDENTIFIED)
-    ]
-    assert len(names) == len(TRIED)
-    assert sorted(marked) == ["cubic stiffness", "quintic stiffness"]
 
 
 def test_drag_is_drawn_against_velocity_in_newtons_at_the_drive(states):

@@ -26,7 +26,6 @@ from snrmjax.model.effects import effect_class
 from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
 from snrmjax.report.figures.diagnosis import (
     CONTROLLED_CAPTION,
-    candidates_figure,
     comparison_figure,
     controlled_velocity_figure,
     effect_laws_figure,
@@ -81,12 +80,6 @@ _CAPTIONS = {
         "leaves about 1 everywhere; dark regions show where the model is wrong."
     ),
     "parts": PARTS_CAPTION,
-    "candidates": (
-        "Improvement of the model by each effect added alone: gain of the Bayesian information "
-        "criterion. Left of the dashed line an effect is not detected; vermilion bars are effects "
-        "of the answer, or not distinguishable from them. Several effects together may "
-        "explain more than the longest bar."
-    ),
 }
 _PROBABILITIES = (
     "The most probable answers, by their evidence: how well each explains these data on average "
@@ -211,8 +204,6 @@ def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """The figures that need no simulation, by the names of their files."""
     figures = {"residuals": misfit_figure(diagnosis)}
-    if any(diagnosis.table):
-        figures["candidates"] = candidates_figure(diagnosis)
     if diagnosis.parts:
         figures["parts"] = parts_figure(diagnosis)
     found = found_effects(diagnosis)
@@ -251,7 +242,7 @@ def diagnosis_report(
         sections=[
             *([_effects_section(diagnosis, shown)] if diagnosis.effects else []),
             _comparison_section(diagnosis, predicted, shown),
-            _candidates_section(diagnosis, shown),
+            _candidates_section(diagnosis),
             _limits_section(diagnosis),
         ],
     )
@@ -354,24 +345,17 @@ def _comparison_section(
     return Section("Model and data, before and after", text, figures, tables)
 
 
-def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) -> Section:
-    header = ("effect", "gain", "parameters")
-    tables = [
-        ReportTable(header, [_tried(row) for row in step[:_SHOWN]], folded=_step(k, len(step)))
-        for k, step in enumerate(diagnosis.table)
-        if step
-    ]
+def _candidates_section(diagnosis: Diagnosis) -> Section:
     rows = [
         (_OTHER_ANSWERS.get(kinds) or kinds_in_words(kinds), in_words(value))
         for kinds, value in list(diagnosis.answer.probabilities.items())[:_SHOWN]
     ]
-    tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
-    figures = [shown["candidates"]] if "candidates" in shown else []
-    return Section("Other answers considered", (), figures, tables)
-
-
-def _step(number_of: int, count: int) -> str:
-    return f"Comparison {number_of + 1}: the best {min(count, _SHOWN)} of {count} candidates"
+    tables = [ReportTable(("answer", "probability"), rows, _PROBABILITIES)]
+    if diagnosis.table:
+        tried = [_tried(row) for row in diagnosis.table]
+        header = ("effect", "gain", "parameters")
+        tables.append(ReportTable(header, tried, folded=f"{len(tried)} fits compared"))
+    return Section("Other answers considered", (), (), tables)
 
 
 def _limits_section(diagnosis: Diagnosis) -> Section:
