@@ -201,7 +201,6 @@ class _Checked(NamedTuple):
 class _Completed(NamedTuple):
     """The completed model, and by level the one completed without it."""
 
-    given: Structure
     whole: CompletedModel
     without: dict[int, Structure]
     refused: tuple[int, ...]  # levels without which it is not physical
@@ -219,7 +218,7 @@ def _completed(model: Structure, checked: _Checked) -> _Completed:
         without[level] = completed_model(model, baseline, fit.kinds, of_others).model
     physical = {level: one for level, one in without.items() if one is not None}
     refused = tuple(level for level, one in without.items() if one is None)
-    return _Completed(model, whole, physical, refused)
+    return _Completed(whole, physical, refused)
 
 
 def _answer(
@@ -236,7 +235,7 @@ def _answer(
         status=fit.status,
         completed=completed.whole.model,
         extended=completed.whole.extended,
-        force_gain=1.0 if gain is None else gain.value,
+        force_gain=1.0 if gain is None else gain,
         probabilities=dict(probabilities),
     )
 
