@@ -198,9 +198,8 @@ def write(
         drives = [
             prediction.drive for prediction in found.predictions for _ in prediction.responses
         ]
-        stds = [response.velocity_std for response in found.responses]
-        given = (folder / "prediction.csv", found.responses)
-        results.write_prediction(*given, drives=drives, velocity_stds=stds, force_unit=unit)
+        file = folder / "prediction.csv"
+        results.write_prediction(file, found.responses, drives=drives, force_unit=unit)
     summary: dict[str, object] = {"program": "snrmjax", "version": __version__, **done}
     if found.coupled is not None:
         summary["coupled_modes"] = coupled_page.write(folder, found.coupled)
