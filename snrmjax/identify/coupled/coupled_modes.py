@@ -336,8 +336,14 @@ def _fitted(
     fields = ("natural_frequency", "damping_ratio")
     linear = [f"mode_{k + 1}.{field}" for k in prescribed for field in fields]
     names += [name for name in linear if name in stated_stds(model)]
-    settings = {"prescribed_modes": prescribed, "harmonic_order": harmonic_order}
-    return calibrate_model(wide, data, names, priors=True, **settings)
+    return calibrate_model(
+        wide,
+        data,
+        names,
+        harmonic_order=harmonic_order,
+        priors=True,
+        prescribed_modes=prescribed,
+    )
 
 
 def _chosen(
