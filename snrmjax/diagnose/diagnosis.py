@@ -20,10 +20,9 @@ from snrmjax.diagnose.answer_by_parts import (
 )
 from snrmjax.diagnose.checks.gains import fitted_gain, notes_on_gains
 from snrmjax.diagnose.checks.residuals import (
-    WithheldLevels,
+    WithheldLevel,
     neighbour_noise,
     rms_misfit,
-    tolerated,
     withheld_level_indices,
     withheld_levels,
     without_level,
@@ -185,7 +184,7 @@ class _Checked(NamedTuple):
     misfit: WeightedMisfit  # with unknown phases set to those of the answer
     located: tuple[Located, ...]
     neighbours: float  # variance over the stated one
-    levels: WithheldLevels | None
+    levels: list[WithheldLevel]  # in the middle and at the top; none below three levels
     parameters: dict[str, Estimate]
 
     @classmethod
@@ -193,7 +192,7 @@ class _Checked(NamedTuple):
         """The checks of fitted effects."""
         fit, misfit = fitted.fit, at_phases_of(fitted.misfit, fitted.fit)
         neighbours = neighbour_noise(misfit, fit)
-        levels = withheld_levels(misfit, fitted.baseline, fit, tolerated(neighbours))
+        levels = withheld_levels(misfit, fitted.baseline, fit)
         located = locate_misfit(misfit, fitted.baseline)
         return cls(fitted, misfit, located, neighbours, levels, _estimates(misfit, fit))
 
@@ -289,7 +288,7 @@ def _notes_on_data(checked: _Checked) -> Iterator[Fact | str]:
             fractions = {"gain": gain, "frequency": 0.5 * stiffness, "damping": damping}
             yield Fact("levels_not_stated", phase=phase, **fractions, of_data=of_data)
     chosen = checked.misfit.predictions.chosen
-    if checked.levels is None:
+    if not checked.levels:
         yield Fact("no_level_left_out", n_levels=chosen.n_levels)
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
     yield from notes_without_phases(chosen, phase, checked.misfit.level_numbers)

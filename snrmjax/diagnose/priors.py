@@ -118,10 +118,6 @@ of states beyond from which on a test may be response-controlled."""
 AS_NOISE = 1.3
 """Multiple of the noise up to which a misfit counts as noise; beyond it every 1σ is too small."""
 
-TOLERATED_VARIANCE = 1.7
-"""Tolerated variance of neighbouring states over the stated one: noise understated by a third is
-no sign of further physics."""
-
 FARTHEST_ERROR = 0.5
 """Relative or rad: an answer that requires larger velocity errors explains nothing; published
 levels differ by 15 %."""
