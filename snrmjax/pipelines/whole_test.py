@@ -196,7 +196,9 @@ def run_whole_test(
     if not options.go_on:
         _stop_at_errors(checkup)
     stage.ends("check")
-    identified, by_points = _identified(data, model)
+    drive_only = not np.isfinite(np.asarray(data.force)).any()
+    free = ("instrument_phase",) if drive_only else ()
+    identified = identify_test(data, model, fit="auto", free=free)
     stage.ends("backbone and damping")
     diagnosed = None
     left_out = not_diagnosed(data, model) if options.diagnose else ()
@@ -208,7 +210,6 @@ def run_whole_test(
         *files.notes,
         *_taken_sensors(files, model),
         *(_note_on_steps(each) for each in stepped),
-        *by_points,
     )
     counts = _used_steps(files, stepped)
     return WholeTest(
@@ -373,15 +374,3 @@ def _stop_at_errors(checkup: Checkup) -> None:
         f"is this intended? {first.name} in {first.where}: {first.evidence} To correct "
         f"it: {first.advice}{more} To continue nevertheless: `--go-on`."
     )
-
-
-def _identified(data: SteadyStates, model: Structure) -> tuple[IdentifiedTest, tuple[Note, ...]]:
-    """A joint fit; curves through the points where the states are too few for one."""
-    drive_only = not np.isfinite(np.asarray(data.force)).any()
-    free = ("instrument_phase",) if drive_only else ()
-    try:
-        return identify_test(data, model, fit="auto", free=free), ()
-    except InputError as error:
-        if drive_only:
-            raise
-        return identify_test(data, model), (Fact("no_joint_fit", why=str(error)),)
