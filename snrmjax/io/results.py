@@ -264,14 +264,14 @@ def write_prediction(
     responses: "Sequence[FittedResponse]",
     *,
     drives: Sequence[float | None] = (),
+    bands: bool = False,
     force_unit: str = "N",
 ) -> None:
     """Write predicted responses at the backbone's sensor; isolated parts follow the main curve.
 
-    `velocity_std_m_s` is 1σ of the velocity amplitude at fixed frequency, for a further level.
-
     Arguments: `drives` are the drive voltages of the responses in V, for a force known only as a
-    voltage (column `drive_v`); `force_unit` as for `load_named`.
+    voltage (column `drive_v`); with `bands` 1σ of the velocity amplitude at fixed frequency, for a
+    further level (column `velocity_std_m_s`); `force_unit` as for `load_named`.
     Raises `ValueError` when the file cannot be written.
     """
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in responses])
@@ -286,7 +286,8 @@ def write_prediction(
         "stable": np.concatenate([c.stable for c in responses]),
     }
     columns = load_named(columns, force_unit) | ({"drive_v": volts} if volts else {})
-    columns["velocity_std_m_s"] = np.concatenate([c.velocity_std for c in responses])
+    if bands:
+        columns["velocity_std_m_s"] = np.concatenate([c.velocity_std for c in responses])
     write_table(path, columns)
 
 

@@ -198,8 +198,9 @@ def write(
         drives = [
             prediction.drive for prediction in found.predictions for _ in prediction.responses
         ]
-        file = folder / "prediction.csv"
-        results.write_prediction(file, found.responses, drives=drives, force_unit=unit)
+        given = (folder / "prediction.csv", found.responses)
+        bands = found.joint is not None
+        results.write_prediction(*given, drives=drives, bands=bands, force_unit=unit)
     summary: dict[str, object] = {"program": "snrmjax", "version": __version__, **done}
     if found.coupled is not None:
         summary["coupled_modes"] = coupled_page.write(folder, found.coupled)
