@@ -118,8 +118,8 @@ headline["resonances of levels left out predicted within 0.1 Hz and 2 %"] = all(
 )
 
 # %%
-# Bars: how much each effect of the library explains by itself; the one-sided stop the most.
-plot.candidates_figure(found)
+# What changes with the amplitude, and how much of it the one-sided stop explains.
+plot.parts_figure(found)
 
 # %% [markdown]
 # The completed model is a model like any other. Its resonance at the largest force, compared with

@@ -478,7 +478,7 @@ soft.plot()
 # without a model, a damping law is nearly as good:
 
 # %%
-# Bars: how much each effect explains by itself; a damping law is nearly as good as the best.
+# A damping law is nearly as good as the best of the fits compared.
 square, cube = (float(value) for value in curved.potential.coefficient)
 free_std = {"111": 0.3 * abs(square), "1111": 0.3 * abs(cube)}
 free = stated(
@@ -487,13 +487,10 @@ free = stated(
 )
 misled = sj.diagnose_model(free, read(full["softening"], "peak"))
 print(verdict(misled))
-plot.candidates_figure(misled)
-
-# %%
-law = next(row for row in misled.table[0] if row.kind.endswith("_damping"))
+law = next(row for row in misled.table if row.kind.endswith("_damping"))
 print(f"best damping law: {law.kind}, gain {law.gain:.0f}", law.parameters)
 headline["stiffness free: a damping law gains nine tenths of what the best explanation does"] = (
-    law.gain > 0.9 * misled.table[0][0].gain
+    law.gain > 0.9 * misled.table[0].gain
 )
 headline["it is damping that falls with amplitude"] = min(law.parameters.values()) < 0
 

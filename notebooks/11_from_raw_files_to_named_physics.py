@@ -113,11 +113,8 @@ plot.fitted_curves_figure([plot.FitSeries("joint fit", fit, points)])
 found = sj.diagnose_model(model, built_on)
 print(found)
 for part in found.located:
-    power = (
-        f", as velocity^({part.exponent:.1f} ± {part.exponent_std:.1f})" if part.exponent else ""
-    )
     low, high = part.velocity_range
-    print(f"located: {part.part.replace('_', ' ')}, {low:.3g} to {high:.3g} m/s{power}")
+    print(f"located: {part.part.replace('_', ' ')}, {low:.3g} to {high:.3g} m/s")
 
 # %% [markdown]
 # **The verdict is `unknown`, and rightly so.** It is clear where the model
@@ -133,9 +130,8 @@ for part in found.located:
 #   second mode at all.
 
 # %%
-# Bars: how much of the misfit each effect explains by itself; the residual receptance leads with
-# five times the next, an error of gain.
-plot.candidates_figure(found)
+# What changes with the amplitude, and what laws and remainder explain of it.
+plot.parts_figure(found)
 
 # %% [markdown]
 # ## 4. The completed model, and withheld levels

@@ -2,7 +2,6 @@
 
 from snrmjax.report import style
 from snrmjax.report.figures.diagnosis import (
-    candidates_figure,
     comparison_figure,
     effect_laws_figure,
     misfit_figure,
@@ -46,7 +45,6 @@ __all__ = [
     "FitSeries",
     "backbone_figure",
     "batch_figure",
-    "candidates_figure",
     "comparison_figure",
     "contributions_figure",
     "damped_mode_figure",

@@ -7,10 +7,9 @@ import numpy as np
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.residuals import scatter_of_levels
-from snrmjax.diagnose.diagnosis_result import Diagnosis, Estimate, completed_model
-from snrmjax.diagnose.drawn_law import DrawnLaw
+from snrmjax.diagnose.diagnosis_result import Diagnosis, DrawnLaw, Estimate, completed_model
 from snrmjax.diagnose.explained_parts import NamedParts, overall
-from snrmjax.diagnose.fitted_effects import FittedEffects, TriedEffect, refined
+from snrmjax.diagnose.fitted_effects import FittedEffects, refined
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit, fit_effect
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
@@ -22,7 +21,6 @@ from snrmjax.diagnose.naming.remainder_law import remainder_laws
 from snrmjax.diagnose.verdict import Kinds, Verdict, answer_of
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.effects import EFFECTS, is_own
 from snrmjax.model.library.free_laws import StiffnessLaw
 from snrmjax.model.structures import Structure
@@ -126,9 +124,7 @@ def fitted_parts(named: NamedParts, predictions: Predictions, data: SteadyStates
     tried = {*fit.kinds, *(kind for one in rivals for kind in one.kinds)}
     for kind in sorted(_own_kinds(named) - tried):
         rivals.append(_fitted(misfit, named.naming, [kind]))  # always fit the user's own effects
-    baseline = baseline_fit(misfit)
-    rows = tuple(_tried(baseline, one) for one in (fit, *rivals) if one.kinds)
-    return FittedEffects(misfit, fit, baseline, (rows,), groups)
+    return FittedEffects(misfit, fit, baseline_fit(misfit), tuple(rivals), groups)
 
 
 def _fitted(misfit: WeightedMisfit, naming: Naming, effects: Iterable[str]) -> EffectFit:
@@ -141,17 +137,6 @@ def _fitted(misfit: WeightedMisfit, naming: Naming, effects: Iterable[str]) -> E
             start = start._replace(starts=(first, *start.starts[:1]))
         fit = fit_effect(misfit, start, fit if fit.kinds else None)
     return fit
-
-
-def _tried(baseline: EffectFit, fit: EffectFit) -> TriedEffect:
-    """A fit with its gain over the given model."""
-    return TriedEffect(
-        fit.kinds[-1],
-        baseline.criterion - fit.criterion,
-        fit.chi_square,
-        dict(zip(fit.labels, fit.values.tolist(), strict=True)),
-        fit.status,
-    )
 
 
 def completed_by_parts(
@@ -237,14 +222,4 @@ def _drawn(named: NamedParts, part: str, remainder: Remainder) -> DrawnLaw:
         force, name = np.asarray(law.coefficient) * passing / shape, "displacement_damping"
     largest = readings.largest * shape
     std = relative * np.max(np.abs(force)) * np.ones_like(force)
-    return DrawnLaw(
-        name,
-        ("odd",),
-        (),
-        Argument.DISPLACEMENT,
-        at * shape,
-        force / shape,
-        std / shape,
-        largest=largest,
-        passing=passing,
-    )
+    return DrawnLaw(name, at * shape, force / shape, std / shape, largest, passing)

@@ -20,10 +20,9 @@ from snrmjax.diagnose.answer_by_parts import (
 )
 from snrmjax.diagnose.checks.gains import fitted_gain, notes_on_gains
 from snrmjax.diagnose.checks.residuals import (
-    WithheldLevels,
+    WithheldLevel,
     neighbour_noise,
     rms_misfit,
-    tolerated,
     withheld_level_indices,
     withheld_levels,
     without_level,
@@ -140,7 +139,7 @@ def diagnose_model(
         discriminating_test=test,
         located=checked.located,
         gap=Gap(before, after, *(checked.levels or (None, None))),
-        checks=Checks(fitted.p_value, float(np.sqrt(checked.neighbours)), completed.without),
+        checks=Checks(fit.p_value, float(np.sqrt(checked.neighbours)), completed.without),
         detection_limits=detection_limits(named.problem, naming, excluded),
         table=fitted.table,
         notes=tuple(notes),
@@ -185,7 +184,7 @@ class _Checked(NamedTuple):
     misfit: WeightedMisfit  # with unknown phases set to those of the answer
     located: tuple[Located, ...]
     neighbours: float  # variance over the stated one
-    levels: WithheldLevels | None
+    levels: list[WithheldLevel]  # in the middle and at the top; none below three levels
     parameters: dict[str, Estimate]
 
     @classmethod
@@ -193,7 +192,7 @@ class _Checked(NamedTuple):
         """The checks of fitted effects."""
         fit, misfit = fitted.fit, at_phases_of(fitted.misfit, fitted.fit)
         neighbours = neighbour_noise(misfit, fit)
-        levels = withheld_levels(misfit, fitted.baseline, fit, tolerated(neighbours))
+        levels = withheld_levels(misfit, fitted.baseline, fit)
         located = locate_misfit(misfit, fitted.baseline)
         return cls(fitted, misfit, located, neighbours, levels, _estimates(misfit, fit))
 
@@ -201,7 +200,6 @@ class _Checked(NamedTuple):
 class _Completed(NamedTuple):
     """The completed model, and by level the one completed without it."""
 
-    given: Structure
     whole: CompletedModel
     without: dict[int, Structure]
     refused: tuple[int, ...]  # levels without which it is not physical
@@ -219,7 +217,7 @@ def _completed(model: Structure, checked: _Checked) -> _Completed:
         without[level] = completed_model(model, baseline, fit.kinds, of_others).model
     physical = {level: one for level, one in without.items() if one is not None}
     refused = tuple(level for level, one in without.items() if one is None)
-    return _Completed(model, whole, physical, refused)
+    return _Completed(whole, physical, refused)
 
 
 def _answer(
@@ -236,7 +234,7 @@ def _answer(
         status=fit.status,
         completed=completed.whole.model,
         extended=completed.whole.extended,
-        force_gain=1.0 if gain is None else gain.value,
+        force_gain=1.0 if gain is None else gain,
         probabilities=dict(probabilities),
     )
 
@@ -290,7 +288,7 @@ def _notes_on_data(checked: _Checked) -> Iterator[Fact | str]:
             fractions = {"gain": gain, "frequency": 0.5 * stiffness, "damping": damping}
             yield Fact("levels_not_stated", phase=phase, **fractions, of_data=of_data)
     chosen = checked.misfit.predictions.chosen
-    if checked.levels is None:
+    if not checked.levels:
         yield Fact("no_level_left_out", n_levels=chosen.n_levels)
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
     yield from notes_without_phases(chosen, phase, checked.misfit.level_numbers)
@@ -306,8 +304,8 @@ def _notes_on_answer(checked: _Checked, completed: _Completed) -> Iterator[Fact]
         yield Fact("not_physical_without", levels=completed.refused)
     if not (fit.status.found_minimum or fit.status is MinimisationStatus.NOT_FITTED):
         yield Fact("answer_not_converged")
-    rows = [row for step in checked.fitted.table for row in step]
-    lost = {row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE}
+    tried = checked.fitted.table
+    lost = {row.kind for row in tried if row.status is MinimisationStatus.NOT_FINITE}
     if lost:
         yield Fact("effects_not_fitted", effects=tuple(sorted(lost)))
 

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.residuals import WithheldLevel
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
-from snrmjax.diagnose.drawn_law import DrawnLaw
 from snrmjax.diagnose.fitted_effects import TriedEffect
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.assessed import DRAWN
@@ -71,6 +70,28 @@ class Estimate(NamedTuple):
 
     value: float
     std: float  # 1σ
+
+
+class DrawnLaw(NamedTuple):
+    """A remainder as an equivalent force at the reference sensor, for lack of a library law.
+
+    `at` is the displacement (m) of that sensor; `force` (N), with its 1σ, is that of a spring or a
+    damper between the sensor's point and the ground, in addition to the linear model. With the mode
+    shape φ at the sensor x = φq, and φ times the force is the modal force. For damping it is the
+    force at the velocity `passing`.
+    """
+
+    law: str  # "spring" or "displacement_damping"
+    at: Float[np.ndarray, " knot"]
+    force: Float[np.ndarray, " knot"]
+    force_std: Float[np.ndarray, " knot"]
+    largest: float  # measured value of `at`; beyond it the law is extrapolated
+    passing: float | None = None  # m/s
+
+    @property
+    def name(self) -> str:
+        """Its class in words."""
+        return str(Fact("law_class", law=self.law))
 
 
 class Answer(NamedTuple):
@@ -134,7 +155,7 @@ class Diagnosis(AbstractResult):
     gap: Gap
     checks: Checks
     detection_limits: dict[str, float]
-    table: tuple[tuple[TriedEffect, ...], ...]  # effects compared, by step of the search
+    table: tuple[TriedEffect, ...]  # effects compared, the answer first
     notes: tuple[Fact | str, ...]
     force_misfit: ForceMisfit
     data: SteadyStates  # as compared: in N, also where a drive voltage was given
@@ -237,18 +258,11 @@ class Diagnosis(AbstractResult):
 
     def variables(self) -> Mapping[str, Variable]:
         """See `AbstractResult`."""
-        tried = [(number + 1, row) for number, step in enumerate(self.table) for row in step]
-        rows = [row for _, row in tried]
-        powers = [
-            (np.nan, np.nan) if p.exponent is None else (p.exponent, p.exponent_std)
-            for p in self.located
-        ]
+        rows = self.table
         ranges = np.array([p.velocity_range for p in self.located]).reshape(-1, 2)
-        exponent = np.array(powers, dtype=float).reshape(-1, 2)
         names = list(self.parameters)
         columns = {
             "candidate": (_texts(row.kind for row in rows), "", "effect compared"),
-            "step": ([number for number, _ in tried], "1", "step of the search"),
             "gain": ([r.gain for r in rows], "1", "decrease of Schwarz's criterion"),
             "chi_square": ([r.chi_square for r in rows], "1", "remaining χ²"),
             "fit_status": (_texts(r.status.value for r in rows), "", "status of the fit"),
@@ -256,14 +270,12 @@ class Diagnosis(AbstractResult):
             "velocity_low_m_s": (ranges[:, 0], "m/s", "lowest velocity affected"),
             "velocity_high_m_s": (ranges[:, 1], "m/s", "highest velocity affected"),
             "p_value": ([p.p_value for p in self.located], "1", "p-value"),
-            "exponent": (exponent[:, 0], "1", "power of amplitude"),
-            "exponent_std": (exponent[:, 1], "1", "1σ of the power"),
             "parameter": (_texts(names), "", "parameter of an effect"),
             "value": ([p.value for p in self.parameters.values()], "unit", "in `unit`"),
             "value_std": ([p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"),
             "unit": (_texts(map(unit_of, names)), "", "of the value"),
         }
-        of = np.repeat(self.coordinates, (5, 6, 4)).tolist()
+        of = np.repeat(self.coordinates, (4, 4, 4)).tolist()
         return {
             name: Variable((dimension,), *column)
             for dimension, (name, column) in zip(of, columns.items(), strict=True)

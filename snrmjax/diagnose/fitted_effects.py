@@ -35,13 +35,23 @@ class FittedEffects(NamedTuple):
     misfit: WeightedMisfit  # with errors propagated through the answer
     fit: EffectFit
     baseline: EffectFit
-    table: tuple[tuple[TriedEffect, ...], ...]
+    rivals: tuple[EffectFit, ...] = ()
     classes: tuple[tuple[str, ...], ...] = ()  # of every effect: itself, then its alternatives
 
     @property
-    def p_value(self) -> float:
-        """p-value of the remaining misfit."""
-        return self.fit.p_value
+    def table(self) -> tuple[TriedEffect, ...]:
+        """The fits of effects with their gains over the given model, the answer's first."""
+        return tuple(
+            TriedEffect(
+                one.kinds[-1],
+                self.baseline.criterion - one.criterion,
+                one.chi_square,
+                dict(zip(one.labels, one.values.tolist(), strict=True)),
+                one.status,
+            )
+            for one in (self.fit, *self.rivals)
+            if one.kinds
+        )
 
 
 def refitted(misfit: WeightedMisfit, fit: EffectFit) -> EffectFit:

@@ -108,9 +108,6 @@ force, the close mode could explain the whole response."""
 OTHER_MODE = 0.1
 """Relative shift of a natural frequency that exceeds any error of a linear test."""
 
-SEEN_POWER = 16.0
-"""χ² that a power law of amplitude must explain to be reported: 4σ."""
-
 BEYOND_DATA = 10.0
 """Multiple of all that was measured beyond which an effect counts as undetectable."""
 
@@ -120,10 +117,6 @@ of states beyond from which on a test may be response-controlled."""
 
 AS_NOISE = 1.3
 """Multiple of the noise up to which a misfit counts as noise; beyond it every 1σ is too small."""
-
-TOLERATED_VARIANCE = 1.7
-"""Tolerated variance of neighbouring states over the stated one: noise understated by a third is
-no sign of further physics."""
 
 FARTHEST_ERROR = 0.5
 """Relative or rad: an answer that requires larger velocity errors explains nothing; published

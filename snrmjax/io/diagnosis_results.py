@@ -4,14 +4,12 @@ import math
 from collections.abc import Sequence
 
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
-from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.drawn_law import DrawnLaw
+from snrmjax.diagnose.diagnosis_result import Diagnosis, DrawnLaw
 from snrmjax.diagnose.location.where import Localisation
 from snrmjax.diagnose.misfit.locating import Located
 from snrmjax.diagnose.naming.parts import PartAnswer
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.verdict import Verdict
-from snrmjax.model.effect_metadata import Argument
 
 _ALIKE = 0.05  # laws above this fraction of the best law's probability count as indistinguishable
 
@@ -27,7 +25,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
     closest rival and the gain needed; `calibration_too` if only a calibration separates some of
     the effects. With the verdict `drawn` there is a `law`: see `DrawnLaw`; of a
     damping that depends on the displacement `force_n` is the force at `at_velocity_m_s`, beyond
-    `measured_up_to` (m or m/s) it is extrapolated, and `further` laws that are needed in addition
+    `measured_up_to` (m) it is extrapolated, and `further` laws that are needed in addition
     have their own tables. `probability` is that of the answer given (of its verdict, or of the
     members of its classes), `probabilities` those of all answers considered. `tried` lists every
     fit compared, with its `status`.
@@ -87,17 +85,14 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
             for row in predicted
         ],
         "tried": [
-            [
-                {
-                    "effect": row.kind,
-                    "gain": row.gain if math.isfinite(row.gain) else None,
-                    "chi_square": row.chi_square if math.isfinite(row.chi_square) else None,
-                    "parameters": row.parameters,
-                    "status": row.status.value,
-                }
-                for row in step
-            ]
-            for step in diagnosis.table
+            {
+                "effect": row.kind,
+                "gain": row.gain if math.isfinite(row.gain) else None,
+                "chi_square": row.chi_square if math.isfinite(row.chi_square) else None,
+                "parameters": row.parameters,
+                "status": row.status.value,
+            }
+            for row in diagnosis.table
         ],
     }
 
@@ -124,10 +119,9 @@ def _test(test: DiscriminatingTest | None) -> dict | None:
 
 
 def _law(law: DrawnLaw) -> dict:
-    is_velocity = law.argument is Argument.VELOCITY
     table: dict = {
         "class": law.name,
-        "velocity_m_s" if is_velocity else "displacement_m": law.at.tolist(),
+        "displacement_m": law.at.tolist(),
         "force_n": law.force.tolist(),
         "force_std_n": law.force_std.tolist(),
         "measured_up_to": law.largest,
@@ -164,14 +158,11 @@ def _by_part(part: PartAnswer) -> dict:
 
 
 def _part(part: Located) -> dict:
-    entry = {
+    return {
         "part": part.part,
         "velocity_range_m_s": list(part.velocity_range),
         "p_value": part.p_value,
     }
-    if part.exponent is not None:
-        entry |= {"exponent": part.exponent, "exponent_std": part.exponent_std}
-    return entry
 
 
 def summarise_localisation(localisation: Localisation) -> dict:

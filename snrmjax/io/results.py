@@ -21,9 +21,10 @@ from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 from snrmjax.simulate.solutions.quasi_periodic import QuasiPeriodicBranch
 
 if TYPE_CHECKING:  # keeps a simulation from importing the identification
+    from snrmjax.identify.inference.fitted_response import FittedResponse
     from snrmjax.identify.inference.identification import Identification
     from snrmjax.identify.pointwise.backbone import BackboneValues
-    from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
+    from snrmjax.identify.pointwise.prediction import Resonance
     from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
 
 BACKBONE_POINTS = 200
@@ -260,18 +261,17 @@ def _with_amplitude(
 
 def write_prediction(
     path: FilePath,
-    responses: "Sequence[PredictedResponse]",
+    responses: "Sequence[FittedResponse]",
     *,
     drives: Sequence[float | None] = (),
-    velocity_stds: Sequence[np.ndarray] = (),
+    bands: bool = False,
     force_unit: str = "N",
 ) -> None:
     """Write predicted responses at the backbone's sensor; isolated parts follow the main curve.
 
     Arguments: `drives` are the drive voltages of the responses in V, for a force known only as a
-    voltage (column `drive_v`); `velocity_stds` are 1σ of each response's velocity amplitude at
-    fixed frequency in m/s, for a further level (column `velocity_std_m_s`); `force_unit` as for
-    `load_named`.
+    voltage (column `drive_v`); with `bands` 1σ of the velocity amplitude at fixed frequency, for a
+    further level (column `velocity_std_m_s`); `force_unit` as for `load_named`.
     Raises `ValueError` when the file cannot be written.
     """
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in responses])
@@ -285,12 +285,10 @@ def write_prediction(
         "velocity_im_m_s": velocity.imag,
         "stable": np.concatenate([c.stable for c in responses]),
     }
-    write_table(
-        path,
-        load_named(columns, force_unit)
-        | ({"drive_v": volts} if volts else {})
-        | ({"velocity_std_m_s": np.concatenate(velocity_stds)} if velocity_stds else {}),
-    )
+    columns = load_named(columns, force_unit) | ({"drive_v": volts} if volts else {})
+    if bands:
+        columns["velocity_std_m_s"] = np.concatenate([c.velocity_std for c in responses])
+    write_table(path, columns)
 
 
 def write_coupled_prediction(

@@ -102,18 +102,6 @@ class AbstractForce(AbstractEffect):
         N), on the left of the equations of motion.
         """
 
-    def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """`cycle_force` by a closed form, where there is one; NaN where that is not valid.
-
-        For friction it is Masing's rule, valid for cycles with two turning points.
-        """
-        return self.cycle_force(displacement, velocity)
-
-    @classmethod
-    def has_quick_formula(cls) -> bool:
-        """Whether `quick_cycle_force` differs from `cycle_force`."""
-        return cls.quick_cycle_force is not AbstractForce.quick_cycle_force
-
 
 class AbstractMemoryless(AbstractForce):
     """A force f(q, q̇) that depends on the instantaneous state alone."""

@@ -15,12 +15,8 @@ from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.library.damping import CubicDamping, QuadraticDamping, VanDerPolDamping
 from snrmjax.model.library.free_laws import (
     AbstractLaw,
-    DampingLaw,
     DisplacementDampingLaw,
-    SlipLaw,
     StiffnessLaw,
-    UnevenDampingLaw,
-    UnevenStiffnessLaw,
 )
 from snrmjax.model.library.friction import CoulombFriction, IwanMicroslip, JenkinsSlider
 from snrmjax.model.library.hysteresis import BoucWen, FrictionContact
@@ -126,15 +122,7 @@ EFFECTS: EffectTable = EffectTable(
 """The effects by their kind in files; `print(EFFECTS)` is a table of them."""
 
 LAWS: dict[str, type[AbstractLaw]] = {
-    law.kind: law
-    for law in (
-        StiffnessLaw,
-        UnevenStiffnessLaw,
-        DampingLaw,
-        UnevenDampingLaw,
-        DisplacementDampingLaw,
-        SlipLaw,
-    )
+    law.kind: law for law in (StiffnessLaw, DisplacementDampingLaw)
 }
 """Tabulated laws by their kind: identified from data where no effect of the library fits."""
 

@@ -1,7 +1,6 @@
 """Identification: backbone and damping from steady states, and predictions from them."""
 
 import dataclasses
-import functools
 import logging
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -30,10 +29,7 @@ from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.missing_resonance import level_in_resonance
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
-    PredictedResponse,
     Resonance,
-    predict_response,
-    resonances,
 )
 from snrmjax.identify.prediction.new_level import DayToDay, new_level
 from snrmjax.identify.prediction.resonance_distribution import (
@@ -64,16 +60,11 @@ class Prediction(NamedTuple):
 
     force: float  # N
     resonances: Sequence[Resonance]  # in order of amplitude
-    responses: Sequence[PredictedResponse]  # the main curve first; those of a joint fit with 1σ
+    responses: Sequence[FittedResponse]  # the main curve first
     further: ResonanceDistribution  # of the resonance of a new level
     drive: float | None = None  # V, where the force is known as a drive voltage
     at: str | None = None  # point of the force, if not that of the test
     unit: str = "N"  # of the force; m/s² of a base
-
-    @property
-    def banded(self) -> list[FittedResponse]:
-        """The responses that have bands."""
-        return [each for each in self.responses if isinstance(each, FittedResponse)]
 
     @property
     def load(self) -> Fact:
@@ -86,36 +77,10 @@ def reach_of(options: IdentifyOptions) -> float:
     return LARGEST_AMPLITUDE_RATIO if options.extrapolate is None else options.extrapolate
 
 
-def predictions_of_points(
-    identification: Identification, model: Structure, options: IdentifyOptions
-) -> tuple[Prediction, ...]:
-    """Predictions of curves through points."""
-    fit = identification.fit
-    ratio: dict[str, Any] = {"largest_amplitude_ratio": reach_of(options)}
-    predictions = []
-    for force in dict.fromkeys(options.predict_force):
-        level = new_level(fit, force, day=_day_of(options), at=options.predict_at)
-        backbone = identification.backbone.moved_by(level.over_test(fit))
-        modes = model.modes if level.forced is None else level.forced
-        predictions.append(
-            Prediction(
-                force,
-                resonances(backbone, modes, force, **ratio),
-                predict_response(backbone, modes, force, **ratio),
-                predicted_resonance(
-                    fit, force, of=level, self_excited=options.self_excited, **ratio
-                ),
-                at=options.predict_at,
-                unit=modes.force_unit,
-            )
-        )
-    return tuple(predictions)
-
-
 def predictions_of_fit(
     fit: JointFit, options: IdentifyOptions
 ) -> tuple[tuple[Prediction, ...], tuple[Note, ...]]:
-    """Predictions of a joint fit, and notes on trends of its levels, which widen the bands."""
+    """Predictions of the curves, and notes on trends of the levels, which widen the bands."""
     loads: list[tuple[float, float | None, bool]] = []
     for force in dict.fromkeys(options.predict_force):
         by_drive = fit.drive_known_only and options.predict_at is None
@@ -252,7 +217,7 @@ class IdentifiedTest(NamedTuple):
     coupled: CoupledDetails | None = None  # None: not requested, and no second mode responds
 
     @property
-    def responses(self) -> list[PredictedResponse]:
+    def responses(self) -> list[FittedResponse]:
         """Predicted responses of all forces."""
         return [response for prediction in self.predictions for response in prediction.responses]
 
@@ -275,8 +240,8 @@ def identify_test(
 ) -> IdentifiedTest:
     """Identify backbone and damping, predict responses, and advise further measurements.
 
-    State by state with curves through the points, or by one joint fit of all states where one of
-    `fit`, `free` and `further` is stated.
+    The curves are those of one joint fit of all states; where one of `fit`, `free` and `further` is
+    stated, with its details.
 
     Arguments: `data` in N or, for a joint fit, in V; `options`, or its fields by keyword.
     Returns an `IdentifiedTest`.
@@ -298,9 +263,7 @@ def identify_test(
     coupled, alone = options.modes == COUPLED_MODES, options
     if coupled:  # responses are then those of the coupled modes
         alone = dataclasses.replace(options, predict_force=())
-    identified = (
-        _by_joint_fit(data, model, alone) if options.is_joint else _by_points(data, model, alone)
-    )
+    identified = _identified(data, model, alone)
     if not coupled and (options.modes is not None or not other_mode_moves(data, model)):
         return identified
     forces = options.predict_force if coupled else ()
@@ -310,55 +273,19 @@ def identify_test(
     return identified._replace(options=options, coupled=details, notes=notes)
 
 
-def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:
-    check_phases(data, "an identification")
-    check_force(data, "an identification state by state")
-    try:
-        identification = identify_backbone(
-            data,
-            model,
-            amplitude=options.amplitude,
-            measure=options.measure,
-            n_knots=options.knots,
-        )
-    except InputError as error:
-        raise with_caveat(error, data, model) from error
-    backbone = identification.backbone
-    predictions = predictions_of_points(identification, model, options)
-    checked_curves = backbone.sampled(_CHECKED, reach=reach_of(options) if predictions else 1.0)
-    notes = (
-        *caveat(data, model, identification.points),
-        *identification.notes,
-        *notes_on_negative_damping(checked_curves),
-        *notes_on_predictions(predictions, backbone, data),
-    )
-    values = backbone.sampled(BACKBONE_POINTS)
-    return IdentifiedTest(
-        data, model, options, identification, values, predictions, _each_once(notes)
-    )
-
-
-def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:
-    names = (options.fit or "auto").split(",")
-    if len(names) > 2:
-        raise InputError(
-            f"--fit takes one or two families, but {options.fit!r} names {len(names)}."
-        )
-    fitted = functools.partial(
-        fit_jointly,
-        data,
-        model,
-        backbone=names[0],
-        damping=names[1] if len(names) == 2 else "auto",
-        free=[name for several in options.free for name in several.split(",")],
-    )
-    _log.info("fits backbone and damping curves to %d states", len(data.frequency))
-    fit = fitted(robust=options.robust or None)
-    data = corrected_states(data, fit)
-    identification = identification_of_fit(data, fit)
+def _identified(data: SteadyStates, model: Structure, options: IdentifyOptions) -> IdentifiedTest:
+    """Points, curves and predictions, with the details of the fit if a joint one is requested."""
+    if options.is_joint:
+        _log.info("fits backbone and damping curves to %d states", len(data.frequency))
+        fit = _joint_fit(data, model, options)
+        data = corrected_states(data, fit)
+        identification = identification_of_fit(data, fit)
+    else:
+        identification = _by_points(data, model, options)
+        fit = identification.fit
     predictions, trends = predictions_of_fit(fit, options)
-    _log.info("compares further measurements")
-    advice = next_measurements(fit, options.further) if options.further else None
+    details = _details(fit, options) if options.is_joint else None
+    advice = details.advice if details else None
     caveats = () if "force_gain" in fit.names() else caveat(data, model, identification.points)
     reach = np.linspace(0.0, reach_of(options) if predictions else 1.0, _CHECKED) * fit.largest[0]
     notes = (
@@ -374,11 +301,11 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
         *(advice.notes if advice else ()),
         *_note_on_advice(advice, options),
     )
-    forces = sorted({one.force for one in advice or ()})
-    responses = tuple(fitted_response(fit, force)[0] for force in forces)
-    details = FitDetails(fit, tuple(contributions(fit)), advice, responses)
-    ends = float(identification.backbone.smallest), float(identification.backbone.largest)
-    values = fitted_values(fit, displacement=np.linspace(*ends, BACKBONE_POINTS))
+    backbone = identification.backbone
+    values = backbone.sampled(BACKBONE_POINTS)
+    if options.is_joint:
+        ends = float(backbone.smallest), float(backbone.largest)
+        values = fitted_values(fit, displacement=np.linspace(*ends, BACKBONE_POINTS))
     return IdentifiedTest(
         data,
         model,
@@ -389,6 +316,45 @@ def _by_joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions
         _each_once(notes),
         joint=details,
     )
+
+
+def _by_points(data: SteadyStates, model: Structure, options: IdentifyOptions) -> Identification:
+    check_phases(data, "an identification")
+    check_force(data, "an identification state by state")
+    try:
+        return identify_backbone(
+            data,
+            model,
+            amplitude=options.amplitude,
+            measure=options.measure,
+            n_knots=options.knots,
+        )
+    except InputError as error:
+        raise with_caveat(error, data, model) from error
+
+
+def _joint_fit(data: SteadyStates, model: Structure, options: IdentifyOptions) -> JointFit:
+    names = (options.fit or "auto").split(",")
+    if len(names) > 2:
+        raise InputError(
+            f"--fit takes one or two families, but {options.fit!r} names {len(names)}."
+        )
+    return fit_jointly(
+        data,
+        model,
+        backbone=names[0],
+        damping=names[1] if len(names) == 2 else "auto",
+        free=[name for several in options.free for name in several.split(",")],
+        robust=options.robust or None,
+    )
+
+
+def _details(fit: JointFit, options: IdentifyOptions) -> FitDetails:
+    _log.info("compares further measurements")
+    advice = next_measurements(fit, options.further) if options.further else None
+    forces = sorted({one.force for one in advice or ()})
+    responses = tuple(fitted_response(fit, force)[0] for force in forces)
+    return FitDetails(fit, tuple(contributions(fit)), advice, responses)
 
 
 def _note_on_gain(fit: JointFit) -> tuple[Note, ...]:

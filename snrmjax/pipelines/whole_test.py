@@ -7,14 +7,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.doctor.check import check_test
 from snrmjax.doctor.column_misreadings import caveat
 from snrmjax.doctor.findings import Checkup
-from snrmjax.identify.joint.notes import outlying_states
 from snrmjax.identify.modal.modes_of_tests import find_modes
 from snrmjax.identify.modal.response_data import joined_responses
 from snrmjax.identify.scaling.scale import DrivePoint, scale_modes
@@ -198,19 +196,20 @@ def run_whole_test(
     if not options.go_on:
         _stop_at_errors(checkup)
     stage.ends("check")
-    identified, by_points = _identified(data, model)
+    drive_only = not np.isfinite(np.asarray(data.force)).any()
+    free = ("instrument_phase",) if drive_only else ()
+    identified = identify_test(data, model, fit="auto", free=free)
     stage.ends("backbone and damping")
     diagnosed = None
     left_out = not_diagnosed(data, model) if options.diagnose else ()
     if options.diagnose and not left_out:
-        diagnosed = diagnose_test(_without_outlying(data, identified), model)
+        diagnosed = diagnose_test(data, model)
         stage.ends("diagnosis")
     notes = (
         *left_out,
         *files.notes,
         *_taken_sensors(files, model),
         *(_note_on_steps(each) for each in stepped),
-        *by_points,
     )
     counts = _used_steps(files, stepped)
     return WholeTest(
@@ -375,25 +374,3 @@ def _stop_at_errors(checkup: Checkup) -> None:
         f"is this intended? {first.name} in {first.where}: {first.evidence} To correct "
         f"it: {first.advice}{more} To continue nevertheless: `--go-on`."
     )
-
-
-def _without_outlying(data: SteadyStates, identified: IdentifiedTest) -> SteadyStates:
-    """The states without outliers of the joint fit, which no effect on the mode explains."""
-    far = outlying_states(identified.joint.fit) if identified.joint is not None else np.arange(0)
-    if not far.size or 2 * far.size > data.n_states:
-        return data
-    keep = np.setdiff1d(np.arange(data.n_states), far)
-    chosen: SteadyStates = jax.tree.map(lambda column: np.asarray(column)[keep], data)
-    return dataclasses.replace(chosen, notes=(*data.notes, Fact("outlying_left_out", n=far.size)))
-
-
-def _identified(data: SteadyStates, model: Structure) -> tuple[IdentifiedTest, tuple[Note, ...]]:
-    """A joint fit; curves through the points where the states are too few for one."""
-    drive_only = not np.isfinite(np.asarray(data.force)).any()
-    free = ("instrument_phase",) if drive_only else ()
-    try:
-        return identify_test(data, model, fit="auto", free=free), ()
-    except InputError as error:
-        if drive_only:
-            raise
-        return identify_test(data, model), (Fact("no_joint_fit", why=str(error)),)

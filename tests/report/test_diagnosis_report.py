@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgba
 from truths.printed_page import unreadable
 
 import snrmjax as sj
@@ -25,11 +24,6 @@ from snrmjax.report.pages import diagnosis as diagnosis_page
 
 SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 100.0, 0.01
 LARGEST = 0.6  # m/s
-TRIED = (
-    ("internal_resonance_1_2", 900.0),
-    ("cubic_stiffness", 800.0),
-    ("quintic_stiffness", 799.0),
-)
 BLIND = Path(__file__).parents[1] / "diagnose" / "blind"
 
 
@@ -54,23 +48,6 @@ def curves(effect, states):
     (axes,) = plot.effect_laws_figure(model(effect), states).axes
     lines = [line for line in axes.lines if len(line.get_xdata()) > 2]
     return axes, [(np.asarray(x), np.asarray(y)) for x, y in (line.get_data() for line in lines)]
-
-
-def test_what_was_considered_has_the_colour_of_the_answer_only_where_it_is_the_answer():
-    """Two effects together explain more than the one that is the best by itself."""
-    tried = [SimpleNamespace(kind=kind, gain=gain) for kind, gain in TRIED]
-    answer = (("cubic_stiffness", "quintic_stiffness"), ("quadratic_damping",))
-    (axes,) = plot.candidates_figure(
-        SimpleNamespace(table=[tried], candidates=answer)  # type: ignore[arg-type]
-    ).axes
-    names = [one.get_text() for one in axes.get_yticklabels()]
-    marked = [
-        name
-        for name, bar in zip(names, axes.patches, strict=True)
-        if bar.get_facecolor() == to_rgba(drawing.IDENTIFIED)
-    ]
-    assert len(names) == len(TRIED)
-    assert sorted(marked) == ["cubic stiffness", "quintic stiffness"]
 
 
 def test_drag_is_drawn_against_velocity_in_newtons_at_the_drive(states):
@@ -198,7 +175,7 @@ def test_limits_and_losing_candidates_are_folded_away(drag, pictures):
     html = html_of(drag[2], pictures)
     folded = re.findall(r"<details>\n<summary>(.*?)</summary>.*?</details>", html, re.DOTALL)
     assert folded[-1] == f"Detection limits of {len(drag[2].detection_limits)} further effects"
-    assert [text[:12] for text in folded[:-1]] == ["Comparison 1"]
+    assert folded[:-1] == [f"{len(drag[2].table)} fits compared"]
 
 
 @pytest.mark.parametrize(
@@ -240,13 +217,11 @@ def test_a_parameter_without_an_error_is_said_to_be_undetermined(drag, pictures)
 
 
 def test_disagreement_is_located_in_words():
-    part = Located("damping", (0.0401, 0.161), 0.0, 1.86, 0.11)
+    part = Located("damping", (0.0401, 0.161), 0.0)
     assert diagnosis_page._located(part) == (
-        "The damping differs from the model's, at velocity amplitudes from 0.0401 to 0.161 m/s; "
-        "the change grows as amplitude^(1.86 ± 0.11) (by chance: below 10⁻¹²)."
+        "The damping differs from the model's, at velocity amplitudes from 0.0401 to 0.161 m/s "
+        "(by chance: below 10⁻¹²)."
     )
-    # Noise that is stated ten times too small makes the 1σ ten times too small.
-    assert "amplitude^(1.9 ± 1.1)" in diagnosis_page._located(part, 10.0)
     part = Located("not_a_function_of_amplitude", (0.001, 0.02), 2e-7)
     assert "not a function of amplitude" in diagnosis_page._located(part)
     assert "from 1 to 20 mm/s (by chance: 2 × 10⁻⁷)" in diagnosis_page._located(part)

@@ -3,20 +3,18 @@
 import numpy as np
 import pytest
 
-from snrmjax.diagnose.drawn_law import DrawnLaw, LawOnset
-from snrmjax.model.effect_metadata import Argument
+from snrmjax.diagnose.diagnosis_result import DrawnLaw
 from snrmjax.report.figures.parts import drawn_laws_figure, law_tables
 
 AT = np.array([0.0, 1e-3, 2e-3, 4e-3])
 SPRING = DrawnLaw(
-    *("spring", ("odd",), (LawOnset(1e-3, 0, True),)),
-    Argument.DISPLACEMENT,
+    "spring",
     AT,
     np.array([0.0, 0.1, 0.4, 1.6]),
     np.array([0.0, 0.05, 0.05, 0.2]),
     2e-3,
 )
-BY_DISPLACEMENT = SPRING._replace(law="displacement_damping", symmetries=(), passing=0.25)
+BY_DISPLACEMENT = SPRING._replace(law="displacement_damping", passing=0.25)
 
 
 def test_the_figure_has_the_curve_its_band_and_marks_what_is_extrapolated():
@@ -41,7 +39,7 @@ def test_two_laws_have_a_panel_each_and_a_table_each():
     assert "0.25 m/s" in figure.axes[1].get_title(loc="left") + figure.axes[1].get_title()
     first, second = law_tables([SPRING, BY_DISPLACEMENT])
     assert len(first.rows) == len(second.rows) == 4
-    assert "hardening" in first.folded
+    assert "odd stiffness" in first.folded
     number, shown = first.rows[2]
     assert float(number) == pytest.approx(2.0)  # mm
     assert "mm" in first.header[0]

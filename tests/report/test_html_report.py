@@ -324,9 +324,10 @@ def test_unstated_noise_and_scatter_of_levels(identification, modes):
     fit = dataclasses.replace(identification.fit, noise=noise)
     rows = dict(identification_summary(dataclasses.replace(identification, fit=fit), modes))
     assert rows["noise"] == (
-        "not stated; states scatter about the curves by 1.20 ± 0.10 % of the measured phasor"
+        "not stated; states scatter about the curves by 1.20 ± 0.10 % of the velocity, errors of "
+        "whole levels excluded"
     )
-    assert rows["scatter from level to level"] == "0.2 Hz and 0.1 % of critical damping (1σ)"
+    assert rows["scatter from level to level"] == "0.25 % in natural frequency, 5 % in damping (1σ)"
 
 
 def test_resonances_beside_the_nearest_of_harmonic_balance(identification):

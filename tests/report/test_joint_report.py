@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from truths.exact_states import damping, modes, noisy, squared
 from truths.joint_fits import exact_fit, noisy_fit
@@ -13,6 +14,7 @@ from truths.printed_page import unreadable
 import snrmjax as sj
 from snrmjax.identify.inference.contributions import Contribution, contributions
 from snrmjax.identify.inference.fitted_response import fitted_response
+from snrmjax.identify.inference.identification import identification_of_fit
 from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 from snrmjax.numerics.units import DEGREE, HERTZ
 from snrmjax.pipelines.identify import FitDetails
@@ -20,6 +22,7 @@ from snrmjax.report import sampling as plot_data
 from snrmjax.report.figures import joint_fit as joint_plot
 from snrmjax.report.html import Report, report_html
 from snrmjax.report.pages import joint_fit as joint_report
+from snrmjax.report.pages.identification import identification_report, identification_summary
 
 TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
 
@@ -92,15 +95,16 @@ def test_a_gain_is_a_number_with_a_unit_and_per_cent():
 
 @pytest.mark.parametrize("free", [(), ("force_gain",)])
 def test_a_report_of_a_joint_fit_tells_the_joint_fit(fit, free):
-    fit = dataclasses.replace(fit, free=free)
-    words = joint_report.words_of_fit(fit)
+    found = identification_of_fit(noisy(1, gain=0.01), fit)
+    found = dataclasses.replace(found, fit=dataclasses.replace(fit, free=free))
+    rows = dict(identification_summary(found, modes()))
     # The exact states' level gain is 1 %, stated; the damping of the truth is the velocity's.
-    assert words.scatter == "1 % in gain (1σ)"
+    assert rows["scatter from level to level"] == "1 % in gain (1σ)"
     argument = "natural frequency: displacement amplitude; damping: velocity amplitude"
-    assert words.argument == argument
-    assert words.noise.startswith("stated; states scatter about the curves by")
-    text = words.caption + " ".join(words.validity)
-    assert "curve through the stars" not in text
+    assert rows["argument of the curves"] == argument
+    assert rows["noise"].startswith("stated; states scatter about the curves by")
+    report = identification_report(found, modes(), {"backbone": Figure()}, title="")
+    text = report.sections[0].figures[0].caption + " ".join(report.sections[-1].text)
     assert "joint fit to all steady states" in text
     assert ("is not in them" in text) == (not free)
     assert ("error of the fitted force gain" in text) == bool(free)

@@ -3,33 +3,16 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
-
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.numerics.facts import Fact
 
 
-class FittedGain(NamedTuple):
-    """A free force gain: acting over recorded force."""
-
-    value: float
-    std: float  # relative 1σ, with all parameters of the answer free
-    farthest: float  # rad, largest phase from resonance of any state
-
-
-def fitted_gain(misfit: WeightedMisfit, fit: EffectFit) -> FittedGain | None:
-    """The force gain as estimated by a fit; None where the forces are known."""
+def fitted_gain(misfit: WeightedMisfit, fit: EffectFit) -> float | None:
+    """The free gain, acting over recorded force, of a fit; None where the forces are known."""
     prior, index = misfit.predictions.force_gain_std, len(misfit.predictions.stated)
-    if prior == 0:
-        return None
-    value = 1 + prior * float(misfit.noise.shared_errors(fit.rows)[index])
-    std = prior * misfit.noise.shared_std(fit.slopes, index)
-    phase = np.angle(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
-    known_phase = ~misfit.predictions.chosen.phase_unknown[:, 0]
-    farthest = float(np.max(np.abs(phase[known_phase]), initial=0.0))
-    return FittedGain(value, std / max(abs(value), 1e-12), farthest)
+    return 1 + prior * float(misfit.noise.shared_errors(fit.rows)[index]) if prior else None
 
 
 class FittedModalMass(NamedTuple):

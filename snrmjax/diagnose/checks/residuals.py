@@ -6,12 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import (
-    chi_square_p_value,
-    unit_columns,
-)
+from snrmjax.diagnose.misfit.noise_model import unit_columns
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 
@@ -21,35 +17,21 @@ class WithheldLevel(NamedTuple):
     level: int
     before: float
     after: float
-    p_value: float  # of `after`, for noise alone
 
 
 def withheld_level(
-    misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, level: int, noise: float = 1.0
+    misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, level: int
 ) -> WithheldLevel:
     """Fit to the other levels alone, and compare with the withheld one.
 
     The misfit is conditional on the other levels: errors that it shares with them through the
-    baseline's stated uncertainty are predicted; its own gain and phase are not. `noise` is the
-    noise variance over the stated one, for the p-value.
+    baseline's stated uncertainty are predicted; its own gain and phase are not.
     """
     withheld = rows_of_level(misfit, level)
     given, n = misfit.noise.covariance.given_rows(~withheld), int(withheld.sum())
     left = [given.decorrelated(_refitted(misfit, one, ~withheld)[1]) for one in (baseline, fit)]
-    before, after = (float(rows @ rows) for rows in left)
-    return WithheldLevel(
-        int(misfit.level_numbers[level]),
-        float(np.sqrt(before / n)),
-        float(np.sqrt(after / n)),
-        chi_square_p_value(after / noise, n),
-    )
-
-
-class WithheldLevels(NamedTuple):
-    """A level between others, and the top one."""
-
-    inner: WithheldLevel
-    outer: WithheldLevel
+    before, after = (float(np.sqrt(rows @ rows / n)) for rows in left)
+    return WithheldLevel(int(misfit.level_numbers[level]), before, after)
 
 
 def withheld_level_indices(misfit: WeightedMisfit) -> tuple[int, ...]:
@@ -67,13 +49,10 @@ def withheld_level_indices(misfit: WeightedMisfit) -> tuple[int, ...]:
 
 
 def withheld_levels(
-    misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, noise: float = 1.0
-) -> WithheldLevels | None:
-    """Cross-validation on the level in the middle and the top one; None below three levels."""
-    levels = [
-        withheld_level(misfit, baseline, fit, k, noise) for k in withheld_level_indices(misfit)
-    ]
-    return WithheldLevels(*levels) if levels else None
+    misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit
+) -> list[WithheldLevel]:
+    """Cross-validation on the level in the middle and the top one; none below three levels."""
+    return [withheld_level(misfit, baseline, fit, k) for k in withheld_level_indices(misfit)]
 
 
 def without_level(
@@ -161,8 +140,3 @@ def scatter_of_levels(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarra
     parts = [some for some in along(misfit, left) if len(some) > 2]
     squares = [np.mean((p[:-2] - 2 * p[1:-1] + p[2:]) ** 2) / 6 for p in parts]
     return np.sqrt(squares) if parts else np.ones(1)
-
-
-def tolerated(noise: float) -> float:
-    """Variance that counts as noise, with tolerance for noise stated slightly too small."""
-    return float(np.clip(noise, 1.0, priors.TOLERATED_VARIANCE))

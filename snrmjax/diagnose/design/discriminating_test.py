@@ -181,28 +181,16 @@ def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Op
 
 
 def _rivals(fitted: FittedEffects, index: int) -> Iterator[EffectFit]:
-    """The rivals of the answer within one class, with their parameters from the table."""
-    misfit = fitted.misfit
+    """The rivals of the answer within one class."""
+    covariance = fitted.misfit.noise.covariance
+    by_kinds = {frozenset(one.kinds): one for one in reversed(fitted.rivals)}
     for name in fitted.classes[index][1:5]:
         kinds = {name if k == index else kind for k, kind in enumerate(fitted.fit.kinds)}
         # One effect with more parameters may replace two.
-        tables = (row.parameters for step in fitted.table[::-1] for row in step)
-        by_kinds = [({label.partition(".")[0] for label in table}, table) for table in tables]
-        last = [one for wanted in (kinds, {name}) for has, one in by_kinds if has == wanted][:1]
-        if not last:
-            continue
-        values, nothing = np.array(list(last[0].values())), np.zeros(0)
-        which = tuple(dict.fromkeys(label.partition(".")[0] for label in last[0]))
-        fit = EffectFit(
-            which, tuple(last[0]), values, np.inf, nothing, nothing[:, None], values, values
-        )
-        columns = columns_of(misfit.predictions, fit)
-        if columns is None:
-            continue
-        rows = in_noise_units(misfit, columns)
-        if np.all(np.isfinite(rows.left)) and np.all(np.isfinite(rows.slopes)):
-            least = refitted_chi_square(rows, misfit.noise.covariance)
-            yield fit._replace(rows=rows.left, slopes=rows.slopes, chi_square=least)
+        rival = by_kinds.get(frozenset(kinds), by_kinds.get(frozenset({name})))
+        if rival is not None and np.all(np.isfinite(rival.rows)):
+            least = refitted_chi_square(Rows(rival.rows, rival.slopes), covariance)
+            yield rival._replace(chi_square=least)
 
 
 class _Hypothesis:

@@ -34,43 +34,24 @@ _POWERS = 4  # of the amplitude, from 0
 Change = Callable[..., np.ndarray]
 
 
-def stiffness_with_power(power: int) -> Change:
-    """Stiffness that changes with a power of the amplitude a."""
-    return lambda r: r.relative_amplitude**power + 0j
-
-
 def stiffness_at_constant_damping_ratio(r: Readings) -> np.ndarray:
     """Of a stiffness with the damping ratio unchanged: 2iζω₀Ω changes by half its fraction."""
     return 1 + 1j * r.damping_ratio * r.relative_frequency
 
 
-def damping_with_power(power: int, frequency_power: int) -> Change:
-    """Damping by a force ∝ a^(power + 1) Ω^frequency_power."""
-    return lambda r: 1j * r.relative_amplitude**power * r.relative_frequency**frequency_power
+def of_force(force: Callable[..., np.ndarray]) -> tuple[Change, Change]:
+    """Change and higher harmonics of a force of displacement, velocity over ω₀ and shape."""
 
-
-def harmonics_of(force: Callable[..., np.ndarray]) -> Change:
-    """Harmonics of a force of displacement, velocity over ω₀ and shape."""
-
-    def higher(r: Readings, one: HarmonicReading, *shape: float) -> np.ndarray:
+    def of_order(r: Readings, order: int, *shape: float) -> np.ndarray:
         omega = r.relative_frequency[:, None]
         return describing.harmonic(
-            lambda q, slope: force(q, omega * slope, *shape), r.relative_amplitude, one.order
+            lambda q, slope: force(q, omega * slope, *shape), r.relative_amplitude, order
         )
 
-    return higher
-
-
-def slider_change(r: Readings, log_slip: float) -> np.ndarray:
-    """Of a slider with the slip displacement exp(`log_slip`)."""
-    lost, damping = describing.slider(r.relative_amplitude, np.exp(log_slip))
-    return lost + 1j * damping
-
-
-def microslip_change(r: Readings, exponent: float) -> np.ndarray:
-    """Of microslip by Masing's rule on a power law."""
-    lost, damping = describing.masing(exponent)
-    return (lost + 1j * damping) * r.relative_amplitude ** (exponent - 1)
+    return (
+        lambda r, *shape: of_order(r, 1, *shape),
+        lambda r, one, *shape: of_order(r, one.order, *shape),
+    )
 
 
 def quadratic_change(r: Readings, log_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -124,11 +105,11 @@ def second_harmonic_of(law: Callable[[Readings, float], tuple[np.ndarray, np.nda
     return higher
 
 
-def harmonics_at_stop(r: Readings, one: HarmonicReading, width: float, log_k: float) -> np.ndarray:
-    """Of the force of a one-sided stop about the mean displacement that it causes."""
-    mean = describing.mean_at_stop(r.relative_amplitude, width, np.exp(log_k))[:, None]
-    return describing.harmonic(
-        lambda q, _: np.maximum(q + mean - width, 0.0), r.relative_amplitude, one.order
+def at_stop(q: np.ndarray, _: np.ndarray, width: float, log_k: float) -> np.ndarray:
+    """Force of a one-sided stop about the mean displacement that it causes."""
+    largest = np.max(np.abs(q), axis=1)
+    return np.maximum(
+        q + describing.mean_at_stop(largest, width, np.exp(log_k))[:, None] - width, 0
     )
 
 

@@ -1,4 +1,4 @@
-"""Describing functions of the library's laws: equivalent stiffness and damping.
+"""Harmonics of the library's laws: equivalent stiffness and damping, and higher ones.
 
 For q = a cos Ωt the fundamental of a force is (k + iΩc) a. Values are relative to ω₀² (k) and to ω₀
 (c), and the argument x is the amplitude over the largest of the test.
@@ -29,12 +29,6 @@ def harmonic(force: Force, x: Amplitudes, order: int) -> Complex[np.ndarray, " s
     return 2 * np.mean(values * np.exp(-1j * order * t), axis=1) / np.maximum(x, 1e-12)
 
 
-def gap(x: Amplitudes, width: float) -> Amplitudes:
-    """Equivalent stiffness of springs of stiffness 1 behind gaps of equal width on both sides."""
-    r = np.clip(width / np.maximum(x, 1e-12), 0.0, 1.0)
-    return np.where(x > width, 1 - (2 / np.pi) * (np.arcsin(r) + r * np.sqrt(1 - r * r)), 0.0)
-
-
 def mean_at_stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
     """Mean displacement q₀ under contact with a one-sided spring of ω₀² `stiffness`.
 
@@ -49,34 +43,6 @@ def mean_at_stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
         too_high = mean + stiffness * contact > 0
         low, high = np.where(too_high, low, mean), np.where(too_high, mean, high)
     return mean
-
-
-def stop(x: Amplitudes, width: float, stiffness: float) -> Amplitudes:
-    """Equivalent stiffness of a one-sided spring behind a gap, over its ω₀² `stiffness`."""
-    mean = mean_at_stop(x, width, stiffness)
-    s = np.clip((width - mean) / np.maximum(x, 1e-12), -1.0, 1.0)
-    angle = np.arccos(s)
-    return (angle - s * np.sqrt(1 - s * s)) / np.pi
-
-
-def slider(x: Amplitudes, slip: float) -> tuple[Amplitudes, Amplitudes]:
-    """Loss of stiffness, and Ω times damping, of a Jenkins slider of stuck stiffness 1."""
-    r = np.clip(slip / np.maximum(x, 1e-12), 0.0, 1.0)
-    t = np.arccos(1 - 2 * r)
-    slips = x > slip
-    lost = np.where(slips, (t - 0.5 * np.sin(2 * t)) / np.pi - 1, 0.0)
-    return lost, np.where(slips, 4 * r * (1 - r) / np.pi, 0.0)
-
-
-def masing(exponent: float, samples: int = 400) -> tuple[float, float]:
-    """Loss of stiffness, and Ω times damping, of the backbone −|x|^p sgn x with Masing's rule.
-
-    At unit amplitude; both scale as x^(p − 1).
-    """
-    t = (np.arange(samples) + 0.5) * np.pi / samples
-    q = np.cos(t)
-    force = -1 + 2 * ((1 - q) / 2) ** exponent
-    return 2 * float(np.mean(force * q)), -2 * float(np.mean(force * np.sin(t)))
 
 
 def slipping(q: Cycle, slope: Cycle, slip: float) -> Cycle:

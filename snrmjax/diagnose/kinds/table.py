@@ -44,14 +44,12 @@ HYPOTHESES: dict[str, Hypothesis] = {
         confounders=(confounders.STIFFNESS_OR_MASS,),
     ),
     stiffness.CubicStiffness.kind: Hypothesis(
-        changes.stiffness_with_power(2),
-        changes.harmonics_of(lambda q, _: 4 / 3 * q**3),
+        *changes.of_force(lambda q, _: 4 / 3 * q**3),
         parameters=lambda r, s: (s * r.natural_frequency**2 / (0.75 * r.largest**2),),
         confounders=(confounders.SEPARATED_BY_MEAN_OR_SECOND_HARMONIC,),
     ),
     stiffness.QuinticStiffness.kind: Hypothesis(
-        changes.stiffness_with_power(4),
-        changes.harmonics_of(lambda q, _: 1.6 * q**5),
+        *changes.of_force(lambda q, _: 1.6 * q**5),
         parameters=lambda r, s: (s * r.natural_frequency**2 / (0.625 * r.largest**4),),
     ),
     stiffness.QuadraticStiffness.kind: Hypothesis(
@@ -78,8 +76,7 @@ HYPOTHESES: dict[str, Hypothesis] = {
         confounders=(confounders.STRUCTURE_OR_FORCE_SPECTRUM,),
     ),
     stiffness.GapStiffness.kind: Hypothesis(
-        lambda r, width: describing.gap(r.relative_amplitude, width) + 0j,
-        changes.harmonics_of(lambda q, _, width: np.sign(q) * np.maximum(np.abs(q) - width, 0.0)),
+        *changes.of_force(lambda q, _, width: np.sign(q) * np.maximum(np.abs(q) - width, 0.0)),
         (changes.GAPS,),
         sign=1,
         parameters=lambda r, s, width: (s * r.natural_frequency**2, width * r.largest),
@@ -87,8 +84,7 @@ HYPOTHESES: dict[str, Hypothesis] = {
         confounders=(confounders.ONE_SIDED_OR_TWO_SIDED,),
     ),
     stiffness.OneSidedStop.kind: Hypothesis(
-        lambda r, width, log_k: describing.stop(r.relative_amplitude, width, np.exp(log_k)) + 0j,
-        changes.harmonics_at_stop,
+        *changes.of_force(changes.at_stop),
         (changes.GAPS, changes.STIFFNESSES),
         sign=1,
         parameters=lambda r, s, width, _: (s * r.natural_frequency**2, width * r.largest),
@@ -96,37 +92,32 @@ HYPOTHESES: dict[str, Hypothesis] = {
         confounders=(confounders.ONE_SIDED_OR_TWO_SIDED,),
     ),
     linear_changes.LinearDampingChange.kind: Hypothesis(
-        changes.damping_with_power(0, 1), parameters=lambda r, s: (s / 2,)
+        lambda r: 1j * r.relative_frequency, parameters=lambda r, s: (s / 2,)
     ),
     damping.QuadraticDamping.kind: Hypothesis(
-        changes.damping_with_power(1, 2),
-        changes.harmonics_of(lambda _, v: 3 * np.pi / 8 * v * np.abs(v)),
+        *changes.of_force(lambda _, v: 3 * np.pi / 8 * v * np.abs(v)),
         sign=1,
         parameters=lambda r, s: (s * 3 * np.pi / (8 * r.largest),),
         confounders=(confounders.SEPARATED_BY_THIRD_HARMONIC,),
     ),
     damping.CubicDamping.kind: Hypothesis(
-        changes.damping_with_power(2, 3),
-        changes.harmonics_of(lambda _, v: 4 / 3 * v**3),
+        *changes.of_force(lambda _, v: 4 / 3 * v**3),
         parameters=lambda r, s: (s / (0.75 * r.largest**2 * r.natural_frequency),),
         confounders=(confounders.SEPARATED_BY_THIRD_HARMONIC,),
     ),
     damping.VanDerPolDamping.kind: Hypothesis(
-        changes.damping_with_power(2, 1),
-        changes.harmonics_of(lambda q, v: 4 * q**2 * v),
+        *changes.of_force(lambda q, v: 4 * q**2 * v),
         parameters=lambda r, s: (4 * s * r.natural_frequency / r.largest**2,),
         confounders=(confounders.SEPARATED_BY_THIRD_HARMONIC,),
     ),
     friction.CoulombFriction.kind: Hypothesis(
-        changes.damping_with_power(-1, 0),
-        changes.harmonics_of(lambda _, v: np.pi / 4 * np.sign(v)),
+        *changes.of_force(lambda _, v: np.pi / 4 * np.sign(v)),
         sign=1,
         parameters=lambda r, s: (s * r.natural_frequency**2 * np.pi * r.largest / 4,),
         confounders=(confounders.FRICTION_OR_FORCE_OFFSET,),
     ),
     friction.JenkinsSlider.kind: Hypothesis(
-        changes.slider_change,
-        changes.harmonics_of(lambda q, v, log_slip: describing.slipping(q, v, np.exp(log_slip))),
+        *changes.of_force(lambda q, v, log_slip: describing.slipping(q, v, np.exp(log_slip))),
         (changes.SLIPS,),
         sign=1,
         parameters=lambda r, s, log_slip: (
@@ -136,8 +127,7 @@ HYPOTHESES: dict[str, Hypothesis] = {
         starts=starts.of_slider,
     ),
     friction.IwanMicroslip.kind: Hypothesis(
-        changes.microslip_change,
-        changes.harmonics_of(describing.microslip),
+        *changes.of_force(describing.microslip),
         (changes.EXPONENTS,),
         sign=1,
         parameters=lambda r, s, p: (s * r.natural_frequency**2 / r.largest ** (p - 1), p),

@@ -7,7 +7,6 @@ Reference: Krack & Gross, Harmonic Balance for Nonlinear Vibration Problems (201
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -76,7 +75,6 @@ class _Formula(NamedTuple):
     """A law with separate parameters, and how its force over a cycle is evaluated."""
 
     effect: Any
-    quick: bool = False
     at_samples: bool = False  # without exact contact times, which take long to compile
 
     def law(self, values: Array) -> Any:
@@ -95,10 +93,7 @@ class _Formula(NamedTuple):
         """Real Fourier coefficients of the force along a motion."""
         law, basis = self.law(values), self.basis(motion)
         x, v = _motion(basis, motion, omega)
-        if self.at_samples:
-            force = jax.vmap(law.force)(x, v)
-        else:
-            force = law.quick_cycle_force(x, v) if self.quick else law.cycle_force(x, v)
+        force = jax.vmap(law.force)(x, v) if self.at_samples else law.cycle_force(x, v)
         return jnp.asarray(basis.analysis) @ force
 
 
@@ -235,7 +230,9 @@ def _force_and_slopes(
     formula: _Formula, values: np.ndarray, motion: np.ndarray, frequency: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fourier coefficients of the force, with derivatives by X_1 (cos, sin) and by parameters."""
-    force, slopes = _by_formulas(_some_slopes, formula, values, motion, frequency)
+    force, slopes = by_blocks(
+        lambda *some: _some_slopes(formula, values, *some), _BLOCK, motion, frequency
+    )
     return force, slopes
 
 
@@ -245,19 +242,9 @@ def _slopes_by_free(
     """Derivatives of the force by the mean and the other harmonics of the motion."""
     # The same with and without exact contact times: one program for both.
     formula = formula._replace(at_samples=False)
-    return _by_formulas(_other_slopes, formula, values, motion, frequency)[0]
-
-
-def _by_formulas(
-    program: Callable[..., tuple], formula: _Formula, values: np.ndarray, *states: np.ndarray
-) -> tuple[np.ndarray, ...]:
-    """By the quick formula where it exists and holds (it is NaN elsewhere), else in full."""
-    quick = formula._replace(quick=True)
-    if type(formula.effect).has_quick_formula():
-        results = by_blocks(lambda *some: program(quick, values, *some), _BLOCK, *states)
-        if all(np.all(np.isfinite(part)) for part in results):
-            return results
-    return by_blocks(lambda *some: program(formula, values, *some), _BLOCK, *states)
+    return by_blocks(
+        lambda *some: _other_slopes(formula, values, *some), _BLOCK, motion, frequency
+    )[0]
 
 
 @compiled

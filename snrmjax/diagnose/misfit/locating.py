@@ -19,8 +19,6 @@ class Located(NamedTuple):
     part: str
     velocity_range: tuple[float, float]  # m/s
     p_value: float
-    exponent: float | None = None  # power of amplitude with which the part changes
-    exponent_std: float | None = None
 
 
 def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...]:
@@ -54,7 +52,7 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
             curve, own = values[some], spread[some, some]
             std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, own, hats), 0.0))
             ends = _range(speed, np.abs(hats @ curve) > 2 * std)
-            parts.append(Located(name, ends, p_value, *power_of_amplitude(knots, curve, own)))
+            parts.append(Located(name, ends, p_value))
     p_value = chi_square_p_value(free, n_force - 2 * _FREE)
     if p_value < priors.REJECTED and float(left @ left) > n_force:
         parts.append(Located("not_a_function_of_amplitude", _range(speed), p_value))
@@ -87,29 +85,3 @@ def _fitted(
     values = -inverse @ (scaled.T @ left)
     left = left + scaled @ values
     return float(left @ left), values / norm, inverse / np.outer(norm, norm)
-
-
-def power_of_amplitude(
-    logarithm: np.ndarray, values: np.ndarray, covariance: np.ndarray
-) -> tuple[float | None, float | None]:
-    """The power of amplitude that a free curve follows, and 1σ; None where it follows none.
-
-    Least squares on the curve with own full covariance: errors of the linear parameters are common
-    to all amplitudes, and individually insignificant changes are kept.
-    """
-    step = 0.01
-    powers = np.arange(-4.0, 8.0, step)
-    # Piecewise linear curves deviate from a power by a fiftieth of the change.
-    interpolation = (0.02 * values) ** 2 + 1e-12 * np.trace(covariance)
-    total = covariance + np.diag(interpolation)
-    root = np.linalg.inv(np.linalg.cholesky(total))
-    curve, shapes = root @ values, root @ np.exp(np.outer(logarithm, powers))
-    explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
-    best = int(np.argmax(explained))
-    left = float(curve @ curve - explained[best])
-    if explained[best] < priors.SEEN_POWER or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
-        return None, None
-    below = np.flatnonzero(explained > explained[best] - 1.0)
-    if below[0] == 0 or below[-1] == len(powers) - 1:
-        return None, None
-    return float(powers[best]), float(0.5 * (powers[below[-1]] - powers[below[0]]) + step / 2)

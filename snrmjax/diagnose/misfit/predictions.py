@@ -25,7 +25,6 @@ from snrmjax.identify.calibrate.calibration_states import (
 )
 from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.parameters import parameter_values, stated_stds
@@ -240,7 +239,7 @@ class Predictions:
     def _evaluated(
         self, values: Float[np.ndarray, "trial parameter"], steps: "_Steps", wanted: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and derivatives; friction by quick formulas or, where these fail, in full."""
+        """Columns and derivatives."""
         group = self.group
         used = np.any(values != group.values, axis=0)
         used[steps.parameter[:wanted][steps.parameter[:wanted] >= 0]] = True
@@ -248,37 +247,23 @@ class Predictions:
         active[group.force[used & (group.force >= 0)]] = True
         n, trials = len(self.chosen.rows), len(values)
         state, trial = np.tile(np.arange(n), trials), np.repeat(np.arange(trials), n)
+        how = programs.Settings(group.names, self.compared, len(self.model.effects))
 
-        def evaluated(quick: bool, rows: np.ndarray) -> tuple[np.ndarray, ...]:
-            def block(some: np.ndarray) -> list[np.ndarray]:
-                at = padded(some, _BLOCK)
-                first = int(trial[some[0]])
-                near = slice(first, first + _BLOCK)  # a block has no more trials than rows
-                ours = [padded(a[near], _BLOCK) for a in (values, steps.length)]
-                arrays: list[Any] = [
-                    *ours,
-                    steps.parameter,
-                    steps.by_error,
-                    active,
-                    np.array(wanted),
-                ]
-                arrays += [state[at], trial[at] - first]
-                how = programs.Settings(group.names, self.compared, len(self.model.effects), quick)
-                output = programs.misfit_columns(
-                    group.model, how, self.motions, programs.Trials(*arrays)
-                )
-                return [np.asarray(a)[: len(some), self.own_columns] for a in output]
+        def block(some: np.ndarray) -> list[np.ndarray]:
+            at = padded(some, _BLOCK)
+            first = int(trial[some[0]])
+            near = slice(first, first + _BLOCK)  # a block has no more trials than rows
+            ours = [padded(a[near], _BLOCK) for a in (values, steps.length)]
+            arrays: list[Any] = [*ours, steps.parameter, steps.by_error, active, np.array(wanted)]
+            arrays += [state[at], trial[at] - first]
+            output = programs.misfit_columns(
+                group.model, how, self.motions, programs.Trials(*arrays)
+            )
+            return [np.asarray(a)[: len(some), self.own_columns] for a in output]
 
-            blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
-            parts = over_cores(block, blocks)
-            return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
-
-        results = evaluated(True, np.arange(n * trials))
-        good = [np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in results]
-        left = np.flatnonzero(~(good[0] & good[1]))
-        if left.size and any(_has_quick_formula(group.names[k]) for k in np.flatnonzero(used)):
-            for part, own in zip(results, evaluated(False, left), strict=True):
-                part[left] = own
+        rows = np.arange(n * trials)
+        parts = over_cores(block, np.split(rows, range(_BLOCK, len(rows), _BLOCK)))
+        results = (np.concatenate(column) for column in zip(*parts, strict=True))
         columns, slopes = (a.reshape(trials, n, *a.shape[1:]) for a in results)
         return columns, slopes
 
@@ -387,12 +372,6 @@ def with_idle_effects(model: Structure, kinds: Sequence[str]) -> Structure:
     mode = modes.natural_frequency.item(j), modes.damping_ratio.item(j)
     added = tuple(without_strength(kind, *mode) for kind in kinds)
     return dataclasses.replace(model, effects=(*model.effects, *added))
-
-
-def _has_quick_formula(name: str) -> bool:
-    """Whether a parameter belongs to an effect with a quick formula."""
-    effect = EFFECTS.get(name.split(".")[0])
-    return effect is not None and issubclass(effect, AbstractForce) and effect.has_quick_formula()
 
 
 def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:

@@ -96,7 +96,6 @@ class Settings(NamedTuple):
     names: tuple[str, ...]  # of all parameters of the structure
     compared: ComparedMotion
     n_given: int  # number of the baseline's effects, which come first
-    quick: bool  # whether friction uses formulas for cycles with only two turning points
 
 
 @compiled
@@ -108,11 +107,10 @@ def misfit_columns(
 ) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
     """The misfit of every row, and its derivatives along the used directions, else zero.
 
-    NaN without convergence, and with `quick` formulas for cycles to which they do not apply.
-    Derivatives are finite differences of motions: the second is solved in a step or two from the
-    first, and the equations are compiled only once.
+    NaN without convergence. Derivatives are finite differences of motions: the second is solved in
+    a step or two from the first, and the equations are compiled only once.
     """
-    names, compared, n_given, quick = settings
+    names, compared, n_given = settings
     n_directions, n_wanted = len(trials.parameter), trials.n_directions
     close = jnp.where(n_wanted > 0, 1e-8, 1e-5)  # tolerance of the last step
 
@@ -128,7 +126,7 @@ def misfit_columns(
             changed = with_parameters(model, names, values + (length @ along) * is_parameter)
             added = changed.effects[n_given:]
             order = compared.harmonic_order
-            forces = [_quick(added[k], order, quick=quick) for k in forces_of(added)]
+            forces = [_force(added[k], order) for k in forces_of(added)]
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
             changed = dataclasses.replace(changed, effects=(*changed.effects[:n_given], *rest))
             perturbed = StateWithErrors(measured, 1.0, trials.by_error @ along)
@@ -214,23 +212,10 @@ def _samples(force: AbstractForce) -> int:
     return 128 if plain else 256
 
 
-def _quick(effect: AbstractEffect, harmonics: int, *, quick: bool) -> AbstractForce:
+def _force(effect: AbstractEffect, harmonics: int) -> AbstractForce:
     if isinstance(effect, AbstractInternalResonance):
         return _Resonance(effect, harmonics)
-    force = cast(AbstractForce, effect)  # one of `forces_of`
-    return _Quick(force) if quick and force.has_quick_formula() else force
-
-
-class _Quick(AbstractForce):
-    """A force by its quick formula, NaN for cycles where that does not hold."""
-
-    kind: ClassVar[str] = "quick"
-    effect: AbstractForce
-
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        return self.effect.quick_cycle_force(displacement, velocity)
+    return cast(AbstractForce, effect)  # one of `forces_of`
 
 
 class _Resonance(AbstractForce):

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -177,8 +177,6 @@ def coupled_modes(
     model: Structure,
     *,
     harmonic_order: int = 7,
-    level_gain_std: float = 0.0,
-    level_phase_std: float = 0.0,
 ) -> CoupledModes:
     """Identify internal resonances of the mode of interest and fit the coupling terms.
 
@@ -191,8 +189,7 @@ def coupled_modes(
     Arguments: `data` of sensors that observe both modes, best two or more with harmonics and their
     errors; without the second harmonic, 1:2 and cubic terms are left out. `model` with both modes
     and, in its potential, the terms already known (also fitted). Frequencies and damping ratios
-    with a stated 1σ are fitted with it as prior. `level_gain_std` (relative) and `level_phase_std`
-    (rad) as for `calibrate_model`.
+    with a stated 1σ are fitted with it as prior.
     Returns `CoupledModes`; without a mode near a harmonic its `interactions` are empty and the
     mode's own stiffness is fitted.
     Raises what `calibrate_model` raises.
@@ -203,18 +200,15 @@ def coupled_modes(
     the formulation with prescribed modes is this package's own.
     """
     check_phases(data, "an identification of coupled modes")
-    settings: dict[str, Any] = {
-        "harmonic_order": harmonic_order,
-        "level_gain_std": level_gain_std,
-        "level_phase_std": level_phase_std,
-    }
     assessed = []
     for pair in _candidates(data, model):
         terms = coupling_terms(pair.mode, pair.other, pair.ratio)
         if not _even_recorded(data):
             # At zero a cubic term affects the fundamental to second order only.
             terms = tuple(term for term in terms if sum(term.powers) % 2 == 0)
-        fit = _fitted(data, model, [term.key for term in terms], (pair.mode, pair.other), settings)
+        fit = _fitted(
+            data, model, [term.key for term in terms], (pair.mode, pair.other), harmonic_order
+        )
         chosen = _chosen(data, model, terms, fit)
         assessed.append((pair._replace(probability=chosen.coupled), terms, chosen, fit))
     assessed.sort(key=lambda one: -one[0].probability)
@@ -230,7 +224,7 @@ def coupled_modes(
         best = chosen.best | kept if coupled else chosen.best & own
         keys = [term.key for term, used in zip(terms, best, strict=True) if used] or keys
         prescribed = (pair.mode, pair.other)
-    final = _fitted(data, model, keys, prescribed, settings)
+    final = _fitted(data, model, keys, prescribed, harmonic_order)
     return CoupledModes(
         calibration=final,
         interactions=interactions,
@@ -335,14 +329,21 @@ def _fitted(
     model: Structure,
     keys: Sequence[str],
     prescribed: tuple[int, ...],
-    settings: dict[str, Any],
+    harmonic_order: int,
 ) -> CalibratedModel:
     wide = _with_terms(model, keys)
     names = [f"potential.{key}" for key in keys]
     fields = ("natural_frequency", "damping_ratio")
     linear = [f"mode_{k + 1}.{field}" for k in prescribed for field in fields]
     names += [name for name in linear if name in stated_stds(model)]
-    return calibrate_model(wide, data, names, priors=True, prescribed_modes=prescribed, **settings)
+    return calibrate_model(
+        wide,
+        data,
+        names,
+        harmonic_order=harmonic_order,
+        priors=True,
+        prescribed_modes=prescribed,
+    )
 
 
 def _chosen(

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless, Scalar
 from snrmjax.model.effect_metadata import Argument, Entries, Part, Shape, Symmetry, parameter
-from snrmjax.model.library.friction import AbstractSliders, Sliders
-from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE
+from snrmjax.numerics.rules import POSITIVE
 
 Knots = Float[Array, " knot"]
 
@@ -44,12 +43,6 @@ def secant_at(magnitude: Scalar, knots: Knots, secant: Knots) -> Scalar:
     return value + slope[-1] * beyond
 
 
-def drawn_force(x: Scalar, knots: Knots, force: Knots, reversed_force: Knots) -> Scalar:
-    """The force at x from a table: `force` at x = knots, −`reversed_force` at x = −knots."""
-    values = jnp.where(x < 0, reversed_force, force) / knots
-    return x * secant_at(jnp.abs(x), knots, values)
-
-
 class AbstractLaw(AbstractEffect):
     """A law given by a table of knots in place of a formula with few parameters.
 
@@ -60,15 +53,6 @@ class AbstractLaw(AbstractEffect):
 def _displacements() -> Any:
     text = "displacement of a knot, above zero"
     return parameter("kg^1/2 m", text, rules=(POSITIVE,), entries=Entries.KNOTS)
-
-
-def _velocities() -> Any:
-    text = "velocity of a knot, above zero"
-    return parameter("kg^1/2 m/s", text, rules=(POSITIVE,), entries=Entries.KNOTS)
-
-
-def _forces(meaning: str) -> Any:
-    return parameter("kg^1/2 m/s²", meaning, entries=Entries.VALUES)
 
 
 class StiffnessLaw(AbstractLaw, AbstractMemoryless):
@@ -83,73 +67,13 @@ class StiffnessLaw(AbstractLaw, AbstractMemoryless):
     )
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.ODD, Argument.DISPLACEMENT)
     displacement: Knots = _displacements()
-    restoring_force: Knots = _forces("restoring force at the displacement")
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        table = self.restoring_force
-        return drawn_force(displacement, self.displacement, table, table)
-
-
-class UnevenStiffnessLaw(AbstractLaw, AbstractMemoryless):
-    """A restoring force f(q) that differs between the two directions.
-
-    `restoring_force` at q = `displacement` and −`reversed_force` at q = −`displacement`, in
-    kg^1/2 m/s² and kg^1/2 m, by ascending displacement: two equal tables are an odd law, a reversed
-    table of zeros is a one-sided stop.
-    """
-
-    kind: ClassVar[str] = "uneven_stiffness_law"
-    description: ClassVar[str] = (
-        "A restoring force of the displacement that differs between the two directions, drawn from "
-        "data."
+    restoring_force: Knots = parameter(
+        "kg^1/2 m/s²", "restoring force at the displacement", entries=Entries.VALUES
     )
-    shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.NEITHER, Argument.DISPLACEMENT)
-    displacement: Knots = _displacements()
-    restoring_force: Knots = _forces("restoring force at the displacement")
-    reversed_force: Knots = _forces("restoring force in the other direction")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        tables = self.displacement, self.restoring_force, self.reversed_force
-        return drawn_force(displacement, *tables)
-
-
-class DampingLaw(AbstractLaw, AbstractMemoryless):
-    """An odd damping force g(q̇): `damping_force` at every `velocity`, mirrored below zero.
-
-    Both tables by ascending velocity, in kg^1/2 m/s² and kg^1/2 m/s.
-    """
-
-    kind: ClassVar[str] = "damping_law"
-    description: ClassVar[str] = (
-        "A damping force of the velocity, the same in both directions, drawn from data."
-    )
-    shape: ClassVar[Shape] = Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY)
-    velocity: Knots = _velocities()
-    damping_force: Knots = _forces("damping force at the velocity")
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        table = self.damping_force
-        return drawn_force(velocity, self.velocity, table, table)
-
-
-class UnevenDampingLaw(AbstractLaw, AbstractMemoryless):
-    """A damping force g(q̇) that differs between the two directions.
-
-    `damping_force` at q̇ = `velocity` and −`reversed_force` at q̇ = −`velocity`, in kg^1/2 m/s² and
-    kg^1/2 m/s, by ascending velocity.
-    """
-
-    kind: ClassVar[str] = "uneven_damping_law"
-    description: ClassVar[str] = (
-        "A damping force of the velocity that differs between the two directions, drawn from data."
-    )
-    shape: ClassVar[Shape] = Shape(Part.DAMPING, Symmetry.NEITHER, Argument.VELOCITY)
-    velocity: Knots = _velocities()
-    damping_force: Knots = _forces("damping force at the velocity")
-    reversed_force: Knots = _forces("damping force in the other direction")
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        return drawn_force(velocity, self.velocity, self.damping_force, self.reversed_force)
+        values = self.restoring_force / self.displacement
+        return displacement * secant_at(jnp.abs(displacement), self.displacement, values)
 
 
 class DisplacementDampingLaw(AbstractLaw, AbstractMemoryless):
@@ -169,29 +93,3 @@ class DisplacementDampingLaw(AbstractLaw, AbstractMemoryless):
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         magnitude = jnp.abs(displacement)
         return velocity * secant_at(magnitude, self.displacement, self.coefficient)
-
-
-class SlipLaw(AbstractLaw, AbstractSliders):
-    """Friction with a free backbone: parallel sliders, each with its own slip displacement.
-
-    `stiffness` k_t (1/s²) of the sliders that slip at every `slip_displacement` x_s (kg^1/2 m),
-    a discrete Iwan density: f = −Σ k_t z with |q − z| ≤ x_s. The stuck stiffness is part of
-    the linear frequency, so that the first loading loses Σ k_t max(q − x_s, 0), and Masing's
-    rule gives the loops.
-    Reference: Iwan, ASME J. Appl. Mech. 33 (1966), 893, doi:10.1115/1.3625199.
-    """
-
-    kind: ClassVar[str] = "slip_law"
-    description: ClassVar[str] = (
-        "Friction of a joint with microslip and a backbone of any shape, drawn from data."
-    )
-    shape: ClassVar[Shape] = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
-    slip_displacement: Knots = parameter(
-        "kg^1/2 m", "displacement at slip", rules=(POSITIVE,), entries=Entries.KNOTS
-    )
-    stiffness: Knots = parameter(
-        "1/s²", "stiffness while it sticks", rules=(NOT_NEGATIVE,), entries=Entries.VALUES
-    )
-
-    def sliders(self) -> Sliders:
-        return Sliders(jnp.asarray(self.stiffness), jnp.asarray(self.slip_displacement))

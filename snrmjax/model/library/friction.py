@@ -11,7 +11,6 @@ Reference: Iwan, ASME J. Appl. Mech. 33 (1966), 893, doi:10.1115/1.3625199.
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -104,18 +103,6 @@ def _settled(
     return jnp.where(sources == untouched, 0.0, position)
 
 
-def slipped_position(
-    displacement: Float[Array, " time"], slip_displacement: Float[Array, " slider"]
-) -> Float[Array, "time slider"]:
-    """`corrected_positions` of a cycle with two turning points; NaN with more."""
-    slip, q = slip_displacement, displacement[:, None]
-    high, low, falling = _turning_points(displacement)
-    down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
-    stuck = jnp.clip(0.0, high - slip, low + slip)
-    position = jnp.where(2 * slip < high - low, jnp.where(falling[:, None], down, up), stuck)
-    return _with_corners(position, displacement, slip)
-
-
 class AbstractSliders(AbstractHysteresis):
     """Friction by parallel sliders; the states are their positions in kg^1/2 m."""
 
@@ -170,19 +157,14 @@ class AbstractSliders(AbstractHysteresis):
         return settled_positions(displacement, self.sliders().slip_displacement)
 
     def cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        return self.for_cycle(displacement)._force_on(displacement, corrected_positions)
-
-    def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """For a cycle with two turning points."""
-        return self.for_cycle(displacement)._force_on(displacement, slipped_position)
+        effect = self.for_cycle(displacement)
+        stiffness, slip = effect.sliders()
+        lost = corrected_positions(displacement, slip) @ stiffness
+        return effect.added_stiffness() * displacement - lost
 
     def for_cycle(self, displacement: Samples) -> Self:
         """The effect with sliders that resolve a cycle; itself if they do not depend on it."""
         return self
-
-    def _force_on(self, displacement: Samples, positions: Callable[..., Array]) -> Samples:
-        stiffness, slip = self.sliders()
-        return self.added_stiffness() * displacement - positions(displacement, slip) @ stiffness
 
 
 class JenkinsSlider(AbstractSliders):
@@ -284,34 +266,6 @@ class IwanMicroslip(AbstractSliders):
         path = with_extremes(displacement)
         sliders = self._sliders_up_to(0.5 * (jnp.max(path) - jnp.min(path)))
         return _settled(path, sliders.slip_displacement) @ -sliders.stiffness
-
-    def quick_cycle_force(self, displacement: Samples, velocity: Samples) -> Samples:
-        """Masing's rule between two turning points."""
-        high, low, falling = _turning_points(displacement)
-        half_range = 0.5 * (high - low)
-        excursion = jnp.where(falling, high - displacement, displacement - low) / 2
-        branch = self._lost(half_range) - 2 * self._lost(excursion)
-        # All slipping sliders are centred on the mean of the cycle.
-        safe = jnp.where(half_range > 0, half_range, 1.0)
-        mean = self.exponent * self._lost(half_range) / safe * 0.5 * (high + low)
-        return jnp.where(falling, -branch, branch) - mean
-
-    def _lost(self, stretch: Array) -> Array:
-        """The force c x^p lost by slip on the backbone."""
-        safe = jnp.where(stretch > 0, stretch, 1.0)
-        return jnp.where(stretch > 0, self.coefficient * safe**self.exponent, 0.0)
-
-
-def _turning_points(displacement: Float[Array, " time"]) -> tuple[Array, Array, Array]:
-    """Largest and smallest value, NaN with more than two turning points, and falling samples."""
-    q = with_extremes(displacement).reshape(-1)
-    n = q.shape[0]
-    top, bottom = jnp.argmax(q), jnp.argmin(q)
-    since, fall = (jnp.arange(n) - top) % n, (bottom - top) % n
-    ahead = jnp.roll(q, -1) - q
-    only_two = jnp.all(jnp.where(since < fall, ahead <= 0, ahead >= 0))
-    valid = jnp.where(only_two, 0.0, jnp.nan)
-    return q[top] + valid, q[bottom] + valid, (since <= fall)[1::2]
 
 
 class CoulombFriction(AbstractHysteresis):

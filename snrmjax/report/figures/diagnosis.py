@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.response_prediction import ControlledVelocityCurve, at_curve_force
 from snrmjax.measure.states import SteadyStates
@@ -38,7 +37,6 @@ from snrmjax.report.style import (
     MEASURED,
     PAGE,
     SERIES,
-    SIMULATED,
     SMALL,
     Style,
     Unit,
@@ -51,7 +49,6 @@ from snrmjax.report.style import (
 )
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 
-_SHOWN = 10  # candidates
 _LARGEST = 5.0  # misfit, in units of noise, at the end of the colour scale
 _SAMPLES = 361  # of a cycle
 _AS_IT_IS = ("Hz", "periods", "%", "%, °", "1", "√kg m/s²")  # units without prefixes
@@ -100,26 +97,6 @@ def misfit_figure(diagnosis: Diagnosis) -> Figure:
     bar.set_label("Misfit of the force (σ of the noise)", fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
     legend(figure)
-    return figure
-
-
-def candidates_figure(diagnosis: Diagnosis) -> Figure:
-    """Gain of every effect by itself, vermilion for those of the answer.
-
-    Also for those that the data cannot distinguish from the answer's.
-
-    The bars are the gain of the Bayesian information criterion (Schwarz) over the model as given;
-    left of the dashed line an effect is not detected.
-    """
-    rows = [row for row in diagnosis.table[0][:_SHOWN] if np.isfinite(row.gain)][::-1]
-    figure, ((axes,),) = panels(COLUMN, 0.7 + 0.22 * max(len(rows), 3), 1, 1)
-    answer = {kind for alike in diagnosis.candidates for kind in alike}
-    colours = [IDENTIFIED if row.kind in answer else MEASURED for row in rows]
-    names, gains = [effect_name(row.kind) for row in rows], [row.gain for row in rows]
-    axes.barh(names, gains, color=colours, height=0.7)
-    axes.axvline(priors.DETECTED, color=SIMULATED, linestyle="--", linewidth=0.8)
-    axes.grid(visible=False, axis="y")
-    name_axes(axes, "", "Gain of the information criterion", "")
     return figure
 
 

@@ -7,10 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.drawn_law import DrawnLaw
+from snrmjax.diagnose.diagnosis_result import Diagnosis, DrawnLaw
 from snrmjax.diagnose.naming.parts import Remainder
-from snrmjax.model.effect_metadata import Argument
 from snrmjax.numerics.rules import InputError
 from snrmjax.report.html import ReportTable, number, with_error
 from snrmjax.report.style import (
@@ -33,8 +31,7 @@ from snrmjax.report.style import (
 LAW_CAPTION = (
     "The force drawn from the data, in addition to the linear model, as if it acted at the "
     "sensor, with its 95 % band. Crosses are the knots in model.toml; dashed parts lie beyond "
-    "the measured range and are extrapolated. For friction it is the initial loading curve "
-    "without the stuck stiffness."
+    "the measured range and are extrapolated."
 )
 PARTS_CAPTION = (
     "Change relative to the model at every state, the errors of its level included, and the "
@@ -58,8 +55,7 @@ def drawn_laws_figure(laws: Sequence[DrawnLaw]) -> Figure:
 
 
 def _draw_law(axes: Axes, law: DrawnLaw) -> None:
-    is_velocity = law.argument is Argument.VELOCITY
-    x, y = unit_for(law.at, "m/s" if is_velocity else "m"), unit_for(law.force, "N")
+    x, y = unit_for(law.at, "m"), unit_for(law.force, "N")
     at, force = law.at / x.size, law.force / y.size
     error = priors.BAND * law.force_std / y.size
     inside = np.abs(law.at) <= 1.0001 * law.largest
@@ -67,25 +63,22 @@ def _draw_law(axes: Axes, law: DrawnLaw) -> None:
     own: Style = {"color": IDENTIFIED, "linewidth": LINE, "label": "drawn law"}
     axes.plot(at[inside], force[inside], marker="x", markersize=3.0, **own)
     axes.axhline(0.0, color="0.6", linewidth=0.6, zorder=1)
-    quantity = "Velocity" if is_velocity else "Displacement"
-    title = law.title
+    title = law.name
     if law.passing is not None:
         title += f" (force at {law.passing:.2g} m/s)"
-    name_axes(axes, plain(title), f"{quantity} ({x.name})", f"Force ({y.name})")
+    name_axes(axes, plain(title), f"Displacement ({x.name})", f"Force ({y.name})")
 
 
 def law_tables(laws: Sequence[DrawnLaw]) -> list[ReportTable]:
-    """The tables of drawn laws: displacement or velocity, force ± 1σ."""
+    """The tables of drawn laws: displacement, force ± 1σ."""
     tables = []
     for law in laws:
-        is_velocity = law.argument is Argument.VELOCITY
-        x, y = unit_for(law.at, "m/s" if is_velocity else "m"), unit_for(law.force, "N")
+        x, y = unit_for(law.at, "m"), unit_for(law.force, "N")
         rows = [
             (number(a / x.size, 3), with_error(f / y.size, e / y.size) if e > 0 else number(0.0))
             for a, f, e in zip(law.at, law.force, law.force_std, strict=True)
         ]
-        quantity = "velocity" if is_velocity else "displacement"
-        header = (f"{quantity} ({x.name})", f"force ± 1σ ({y.name})")
+        header = (f"displacement ({x.name})", f"force ± 1σ ({y.name})")
         tables.append(ReportTable(header, rows, folded=f"Table of the law: {law.name}"))
     return tables
 

@@ -26,7 +26,6 @@ from snrmjax.model.effects import effect_class
 from snrmjax.pipelines.diagnose import DiagnosedTest, SimulatedLevels
 from snrmjax.report.figures.diagnosis import (
     CONTROLLED_CAPTION,
-    candidates_figure,
     comparison_figure,
     controlled_velocity_figure,
     effect_laws_figure,
@@ -48,7 +47,6 @@ from snrmjax.report.html import (
     Section,
     minus,
     number,
-    with_error,
     write_report,
 )
 from snrmjax.report.pages.resonance_table import resonance_in_words, resonance_rows, velocity_unit
@@ -82,12 +80,6 @@ _CAPTIONS = {
         "leaves about 1 everywhere; dark regions show where the model is wrong."
     ),
     "parts": PARTS_CAPTION,
-    "candidates": (
-        "Improvement of the model by each effect added alone: gain of the Bayesian information "
-        "criterion. Left of the dashed line an effect is not detected; vermilion bars are effects "
-        "of the answer, or not distinguishable from them. Several effects together may "
-        "explain more than the longest bar."
-    ),
 }
 _PROBABILITIES = (
     "The most probable answers, by their evidence: how well each explains these data on average "
@@ -212,8 +204,6 @@ def responses_figure(diagnosis: Diagnosis, simulated: SimulatedLevels) -> Figure
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """The figures that need no simulation, by the names of their files."""
     figures = {"residuals": misfit_figure(diagnosis)}
-    if any(diagnosis.table):
-        figures["candidates"] = candidates_figure(diagnosis)
     if diagnosis.parts:
         figures["parts"] = parts_figure(diagnosis)
     found = found_effects(diagnosis)
@@ -252,7 +242,7 @@ def diagnosis_report(
         sections=[
             *([_effects_section(diagnosis, shown)] if diagnosis.effects else []),
             _comparison_section(diagnosis, predicted, shown),
-            _candidates_section(diagnosis, shown),
+            _candidates_section(diagnosis),
             _limits_section(diagnosis),
         ],
     )
@@ -349,30 +339,23 @@ def _comparison_section(
             ReportTable(header, resonance_rows(predicted, diagnosis.data.force_unit), caption)
         )
     figures = [shown[name] for name in ("parts", "responses", "residuals") if name in shown]
-    text = [_located(part, diagnosis.gap.after) for part in diagnosis.located]
+    text = [_located(part) for part in diagnosis.located]
     if not text:
         text = ["No part of the force balance differs from the model by more than the noise."]
     return Section("Model and data, before and after", text, figures, tables)
 
 
-def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) -> Section:
-    header = ("effect", "gain", "parameters")
-    tables = [
-        ReportTable(header, [_tried(row) for row in step[:_SHOWN]], folded=_step(k, len(step)))
-        for k, step in enumerate(diagnosis.table)
-        if step
-    ]
+def _candidates_section(diagnosis: Diagnosis) -> Section:
     rows = [
         (_OTHER_ANSWERS.get(kinds) or kinds_in_words(kinds), in_words(value))
         for kinds, value in list(diagnosis.answer.probabilities.items())[:_SHOWN]
     ]
-    tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
-    figures = [shown["candidates"]] if "candidates" in shown else []
-    return Section("Other answers considered", (), figures, tables)
-
-
-def _step(number_of: int, count: int) -> str:
-    return f"Comparison {number_of + 1}: the best {min(count, _SHOWN)} of {count} candidates"
+    tables = [ReportTable(("answer", "probability"), rows, _PROBABILITIES)]
+    if diagnosis.table:
+        tried = [_tried(row) for row in diagnosis.table]
+        header = ("effect", "gain", "parameters")
+        tables.append(ReportTable(header, tried, folded=f"{len(tried)} fits compared"))
+    return Section("Other answers considered", (), (), tables)
 
 
 def _limits_section(diagnosis: Diagnosis) -> Section:
@@ -430,18 +413,11 @@ _PARTS = {
 }
 
 
-def _located(part: Located, misfit: float = 1.0) -> str:
-    """One part of the disagreement as a sentence.
-
-    The 1σ of its power of amplitude is widened by the remaining misfit, in units of noise.
-    """
+def _located(part: Located) -> str:
+    """One part of the disagreement as a sentence."""
     unit = unit_for(part.velocity_range, "m/s")
     low, high = (f"{one / unit.size:.3g}" for one in part.velocity_range)
     small = part.p_value < _LEAST_P_VALUE
     chance = "below 10⁻¹²" if small else number(part.p_value, 1)
-    text = f"{_PARTS[part.part]}, at velocity amplitudes from {low} to {high} {unit.name}"
-    if part.exponent is not None:
-        power = with_error(part.exponent, (part.exponent_std or 0.0) * max(1.0, misfit))
-        how = "grows" if part.exponent > 0 else "falls"
-        text += f"; the change {how} as amplitude^({power})"
-    return f"{text} (by chance: {chance})."
+    where = f"at velocity amplitudes from {low} to {high} {unit.name}"
+    return f"{_PARTS[part.part]}, {where} (by chance: {chance})."

@@ -27,6 +27,7 @@ from snrmjax.report.html import (
     with_error,
 )
 from snrmjax.report.sampling import sample_backbone, velocity_of
+from snrmjax.report.sentences.identify import in_words
 from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 
@@ -37,7 +38,8 @@ NO_SCATTER = "none beyond the noise"
 _BACKBONE_CAPTION = (
     "Backbone. Blue dots are measured steady states. Each gives one star: (a) the natural "
     "frequency at its amplitude, (b) the phase resonance at 0°, (c) the damping ratio. "
-    "{line} Check that the stars lie on one line "
+    "The line is the joint fit to all steady states, not a curve drawn through the stars; the band "
+    "is its 95 % range. Check that the stars lie on one line "
     "regardless of phase: a spread with phase at one amplitude means that the assumptions of the "
     "method do not hold. Grey crosses are steady states left out of the curves."
 )
@@ -62,52 +64,11 @@ _VALIDITY = (
     "the displacement amplitude, which is the velocity over the frequency of the force. A point "
     "measured at velocity v and angular frequency Ω therefore lies on the backbone at the velocity "
     "v·ω/Ω, with ω its natural frequency (unless the velocity was chosen as argument).",
-    "{bands}",
+    "Error bars and bands are 95 %. The bands include the noise, stated or estimated, and errors "
+    "common to the points of one level{gain}",
     "Reference: Kwarta & Allen, Nonlinear Normal Mode Backbone Estimation with Near-Resonant "
     "Steady State Inputs.",
 )
-
-
-class CurveWords(NamedTuple):
-    """Texts of a report on its curves: how they are drawn, bands, noise and scatter."""
-
-    line: str
-    bands: str
-    noise: str
-    scatter: str
-    argument: str
-
-    @property
-    def caption(self) -> str:
-        """Caption of the figure of backbone and damping."""
-        return _BACKBONE_CAPTION.format(line=self.line)
-
-    @property
-    def validity(self) -> list[str]:
-        """Interpretation and validity of the report."""
-        return [text.format(bands=self.bands) for text in _VALIDITY]
-
-
-def words_of_points(identification: Identification) -> CurveWords:
-    """Texts on curves through the points of single states."""
-    return CurveWords(
-        line="The line is the curve through the stars, the band its 95 % range.",
-        bands="Error bars and bands are 95 %. They include random errors only: stated noise or, "
-        "where none was stated, the scatter of the points, and errors common to one level."
-        f"{GAIN_NOT_IN_BANDS}",
-        noise=noise_in_words(identification.fit.noise, "measured phasor"),
-        scatter=_level_scatter(identification),
-        argument=f"{identification.points.argument} amplitude",
-    )
-
-
-def noise_in_words(noise: NoiseEstimate, of: str) -> str:
-    """The noise as stated, or as estimated in per cent `of` something."""
-    if noise.stated:
-        scale = with_error(noise.scale, noise.scale_std)
-        return f"stated; states scatter about the curves by {scale} times as much"
-    percent = with_error(100 * noise.scale, 100 * noise.scale_std)
-    return f"not stated; states scatter about the curves by {percent} % of the {of}"
 
 
 class ComparedResponses(NamedTuple):
@@ -129,20 +90,19 @@ def identification_report(
     notes: Iterable[str] = (),
     responses: ComparedResponses | None = None,
     further: Sequence[Section] = (),
-    words: CurveWords | None = None,
 ) -> Report:
     """The report of an identification: numbers, notes, backbone, predictions, validity.
 
     Arguments: `figures` by name: `backbone`, `prediction` where there are responses, and `nnm`
     where the backbone is compared with the true nonlinear mode; `done` names the inputs (data
     file, model, options); `notes` come before those of the identification; `responses` under the
-    requested forces; `further` sections before the last one; `words` on curves that do
-    not go through the points.
+    requested forces; `further` sections before the last one.
     Returns a `Report` for `write_report`.
     """
-    backbone = identification.backbone
-    words = words or words_of_points(identification)
-    caption = words.caption + (TRUTH_CAPTION if "nnm" in figures else "")
+    backbone, fitted = identification.backbone, "force_gain" in identification.fit.free
+    gain = ", and the error of the fitted force gain." if fitted else f".{GAIN_NOT_IN_BANDS}"
+    validity = [text.format(gain=gain) for text in _VALIDITY]
+    caption = _BACKBONE_CAPTION + (TRUTH_CAPTION if "nnm" in figures else "")
     shown = [ReportFigure(figures["backbone"], caption)]
     sections = [Section("Backbone and damping", (), shown)]
     if responses is not None and "prediction" in figures:
@@ -157,12 +117,12 @@ def identification_report(
         title=title,
         done=[*(done or {}).items(), PROGRAM],
         result=identification_sentence(identification, modes),
-        summary=identification_summary(identification, modes, words),
+        summary=identification_summary(identification, modes),
         notes=list(dict.fromkeys(map(str, [*notes, *identification.notes]))),
         sections=[
             *sections,
             *further,
-            Section("How to read this, and when to trust it", words.validity),
+            Section("How to read this, and when to trust it", validity),
         ],
     )
 
@@ -232,12 +192,10 @@ def linear_mode_row(modes: LinearModes) -> tuple[str, str]:
     return "linear mode", f"{linear:.5g} Hz, {100 * damping:.3g} % damping"
 
 
-def identification_summary(
-    identification: Identification, modes: LinearModes, words: CurveWords | None = None
-) -> Rows:
+def identification_summary(identification: Identification, modes: LinearModes) -> Rows:
     """The headline numbers of an identification as names and texts, ± being 95 %."""
-    words = words or words_of_points(identification)
-    points = identification.points
+    points, noise = identification.points, identification.fit.noise
+    scatter = f"{in_words(noise.level_std)} (1σ)" if np.any(noise.level_std > 0) else NO_SCATTER
     frequency, damping = _courses(identification)
     unit = unit_for(frequency.velocity, "m/s")
 
@@ -262,9 +220,9 @@ def identification_summary(
         ("steady states used", f"{used} of {every} at sensor {points.sensor}"),
         ("left out", _left_out(identification)),
         ("phases measured", _phases(identification)),
-        ("noise", words.noise),
-        ("scatter from level to level", words.scatter),
-        ("argument of the curves", words.argument),
+        ("noise", _noise(noise)),
+        ("scatter from level to level", scatter),
+        ("argument of the curves", _argument(identification)),
     ]
     if frequency.has_inner_extreme():
         rows.insert(2, ("lowest to highest frequency", extremes(frequency)))
@@ -291,12 +249,22 @@ def _phases(identification: Identification) -> str:
     return minus(f"{phase.min():.0f}° to {phase.max():.0f}°, 0° is resonance")
 
 
-def _level_scatter(identification: Identification) -> str:
-    hertz = identification.level_frequency_std / HERTZ
-    damping = 100 * identification.level_damping_std
-    if not hertz > 0 and not damping > 0:
-        return NO_SCATTER
-    return f"{hertz:.2g} Hz and {damping:.2g} % of critical damping (1σ)"
+def _noise(noise: NoiseEstimate) -> str:
+    """The scatter of the states, over their stated noise or in per cent."""
+    scale = 1.0 if noise.stated else 100.0
+    each = with_error(scale * noise.scale, scale * noise.scale_std)
+    stated, of = ("", "times as much") if noise.stated else ("not ", "% of the velocity")
+    scatter = f"{stated}stated; states scatter about the curves by {each} {of}"
+    return f"{scatter}, errors of whole levels excluded"
+
+
+def _argument(identification: Identification) -> str:
+    """The amplitudes that the curves are functions of."""
+    unknowns = identification.fit.unknowns
+    squared, damping = unknowns.squared_frequency.argument, unknowns.modal_damping.argument
+    if squared == damping == "displacement":
+        return f"{identification.points.argument} amplitude"
+    return f"natural frequency: {squared} amplitude; damping: {damping} amplitude"
 
 
 def resonance_table(

@@ -23,7 +23,6 @@ from snrmjax.report.pages.joint_fit import (
     curves_in_words,
     joint_figures,
     joint_sections,
-    words_of_fit,
 )
 from snrmjax.report.sampling import BAND, SHOWN_AMPLITUDES, VELOCITY, ShownAmplitude
 from snrmjax.report.style import PrintedFigure, save_figures
@@ -174,7 +173,6 @@ def findings_report(
             [f"Resonance at {p.load}: {where_in_words(p.further)}." for p in found.predictions],
         ),
         further=further,
-        words=None if found.joint is None else words_of_fit(found.joint.fit),
     )
 
 
@@ -200,9 +198,9 @@ def write(
         drives = [
             prediction.drive for prediction in found.predictions for _ in prediction.responses
         ]
-        stds = [b.velocity_std for prediction in found.predictions for b in prediction.banded]
         given = (folder / "prediction.csv", found.responses)
-        results.write_prediction(*given, drives=drives, velocity_stds=stds, force_unit=unit)
+        bands = found.joint is not None
+        results.write_prediction(*given, drives=drives, bands=bands, force_unit=unit)
     summary: dict[str, object] = {"program": "snrmjax", "version": __version__, **done}
     if found.coupled is not None:
         summary["coupled_modes"] = coupled_page.write(folder, found.coupled)
@@ -210,9 +208,8 @@ def write(
         results.write_backbone(folder / "backbone.csv", found.identification, added=added)
     else:
         _write_fit(folder, found.joint, added)
-        banded = [response for prediction in found.predictions for response in prediction.banded]
-        details = found.joint
-        summary["joint_fit"] = joint_results.summarise_fit(details.fit, banded, details.fractions)
+        of_fit = found.joint.fit, found.responses, found.joint.fractions
+        summary["joint_fit"] = joint_results.summarise_fit(*of_fit)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
         load_named(results.summarise_resonance(each), unit) | _further_load(prediction)

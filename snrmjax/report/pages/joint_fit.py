@@ -20,14 +20,7 @@ from snrmjax.report.figures.joint_fit import (
     residuals_figure,
 )
 from snrmjax.report.html import ReportFigure, ReportTable, Section, minus, with_error
-from snrmjax.report.pages.identification import (
-    GAIN_NOT_IN_BANDS,
-    NO_SCATTER,
-    CurveWords,
-    noise_in_words,
-)
 from snrmjax.report.sampling import VELOCITY, ShownAmplitude
-from snrmjax.report.sentences.identify import in_words
 from snrmjax.report.style import PrintedFigure, unit_for
 
 _LISTED = 12  # contributions by name; the rest is summed in one row
@@ -116,24 +109,6 @@ def curves_in_words(fit: JointFit) -> str:
     """The families of both curves: "natural frequency: power law of displacement; damping: …"."""
     squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
     return f"natural frequency: {squared.words}; damping: {damping.words}"
-
-
-def words_of_fit(fit: JointFit) -> CurveWords:
-    """Texts of a report on the curves of a joint fit."""
-    noise = fit.noise
-    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
-    fitted = "force_gain" in fit.free
-    gain = ", and the error of the fitted force gain." if fitted else f".{GAIN_NOT_IN_BANDS}"
-    return CurveWords(
-        line="The line is the joint fit to all steady states, not a curve drawn through the "
-        "stars; the band is its 95 % range.",
-        bands="Error bars and bands are 95 %. The bands of the joint fit include the noise, stated "
-        f"or estimated, and errors common to the points of one level{gain}",
-        noise=f"{noise_in_words(noise, 'velocity')}, errors of whole levels excluded",
-        scatter=f"{in_words(noise.level_std)} (1σ)" if np.any(noise.level_std > 0) else NO_SCATTER,
-        argument=f"natural frequency: {squared.argument} amplitude; damping: {damping.argument} "
-        "amplitude",
-    )
 
 
 def parameter_table(summary: dict, gain_unit: str = "") -> ReportTable:

@@ -115,9 +115,6 @@ def _by_import(advice: object, commands: tuple[str, ...]) -> str:
 
 
 SENTENCES: dict[str, Wording] = {
-    "outlying_left_out": (
-        "{n:#state} far from the single-mode curves left out of the diagnosis (see the backbone)."
-    ),
     "advice_by_import": _by_import,
     "advice_at_once": "{names} together: {command}. Separately, {alone}",
     "load": _load,
@@ -156,7 +153,6 @@ SENTENCES: dict[str, Wording] = {
         "no sensor is named in {files}: the model's only one, {sensor}, is assumed. Name it in a "
         "column `sensor`, or by `--sensor` of the import."
     ),
-    "no_joint_fit": ("curves are fitted to single points, as a joint fit was not possible: {why}"),
     "isolated_searched": (
         "{n} further branches found at {force:g} N, of {n_starts} starts ({n_failed} failed)"
     ),

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 from truths.made_up_misfits import LEVEL, N_ROWS, fit_to, misfit_of, noise
 
 from snrmjax.diagnose.checks.residuals import withheld_level
@@ -27,5 +26,4 @@ def test_a_withheld_level_is_compared_with_its_prediction_by_the_others():
     withheld = withheld_level(misfit, fit_to(rows), fit_to(rows, slopes), 3)
     # Rounding of two inverses of well-conditioned matrices.
     assert rows_out.sum() * withheld.after**2 == pytest.approx(exact, rel=1e-6)
-    assert withheld.p_value == pytest.approx(chi2.sf(exact, rows_out.sum()), rel=1e-5)
     assert withheld.level == 4

@@ -28,7 +28,7 @@ from snrmjax.diagnose.design.discriminating_test import (
     discriminating_test,
     recommendation,
 )
-from snrmjax.diagnose.fitted_effects import FittedEffects, TriedEffect
+from snrmjax.diagnose.fitted_effects import FittedEffects
 from snrmjax.diagnose.misfit.candidates import candidate, only_by_calibration
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect
 from snrmjax.diagnose.misfit.noise_model import shared_covariance
@@ -62,17 +62,7 @@ def fitted(*rivals):
     misfit, scales = weighted_misfit(predictions), scales_of(predictions)
     nothing = baseline_fit(misfit)
     fits = [fit_effect(misfit, candidate(kind, scales)) for kind in rivals]
-    table = tuple(
-        TriedEffect(
-            fit.kinds[0],
-            nothing.criterion - fit.criterion,
-            fit.chi_square,
-            dict(zip(fit.labels, fit.values.tolist(), strict=True)),
-            fit.status,
-        )
-        for fit in fits
-    )
-    return FittedEffects(misfit, fits[0], nothing, (table,), (rivals,))
+    return FittedEffects(misfit, fits[0], nothing, tuple(fits[1:]), (rivals,))
 
 
 def test_a_common_force_gain_is_shared_by_both_tests():

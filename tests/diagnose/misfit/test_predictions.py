@@ -110,11 +110,9 @@ def test_misfits_are_those_of_newtons_method(predictions, kind):
     needed = inverse_force(model, data, harmonic_order=HARMONICS)
     assert needed.converged.all()
     misfit = np.asarray(needed.force) / np.asarray(data.force) - 1
-    # Masing's formula stands for sliders, of which a rule of 48 points makes an error of 1e-4.
     # Steps end below 1e-5.
-    tolerance = 1e-4 if kind == "iwan_microslip" else 1e-5
     change = np.max(np.abs(misfit - baseline_misfit(ours)))
-    assert np.max(np.abs(found - misfit)) < tolerance * max(change, 1e-3)
+    assert np.max(np.abs(found - misfit)) < 1e-5 * max(change, 1e-3)
 
 
 @pytest.mark.parametrize("kind", EFFECTS)

@@ -1,4 +1,4 @@
-"""Laws given by knots: against formulas, plain marches, and SciPy's integration in time."""
+"""Laws given by knots: against formulas and SciPy's integration in time."""
 
 import jax
 import jax.numpy as jnp
@@ -19,28 +19,15 @@ TABLES = {
         {"displacement": KNOTS, "restoring_force": KNOTS**3},
         lambda q, v: q**3,
     ),
-    "uneven_stiffness_law": (
-        {"displacement": KNOTS, "restoring_force": KNOTS**2, "reversed_force": 0.5 * KNOTS**3},
-        lambda q, v: np.where(q > 0, q**2, 0.5 * q**3),
-    ),
-    "damping_law": (
-        {"velocity": KNOTS, "damping_force": KNOTS**1.5},
-        lambda q, v: np.abs(v) ** 0.5 * v,
-    ),
-    "uneven_damping_law": (
-        {"velocity": KNOTS, "damping_force": KNOTS**2, "reversed_force": KNOTS},
-        lambda q, v: np.where(v > 0, v**2, v),
-    ),
     "displacement_damping_law": (
         {"displacement": KNOTS, "coefficient": np.sin(KNOTS)},
         lambda q, v: np.sin(np.abs(q)) * v,
     ),
 }
-SLIDERS = {"slip_displacement": np.array([0.1, 0.3, 0.9]), "stiffness": np.array([2.0, 1.0, 0.5])}
 
 
 def law(kind):
-    return make_effect(kind, SLIDERS if kind == "slip_law" else TABLES[kind][0])
+    return make_effect(kind, TABLES[kind][0])
 
 
 @pytest.mark.parametrize("kind", TABLES)
@@ -69,34 +56,6 @@ def test_a_law_has_a_finite_slope_everywhere_and_goes_on_straight(kind):
     np.testing.assert_allclose(beyond, beyond[0], rtol=1e-9)
     before = float(jax.grad(line)(jnp.array(0.9999)))
     assert before == pytest.approx(beyond[0], rel=2e-3)  # the slope is continuous
-
-
-def test_sliders_of_a_slip_law_against_a_plain_march():
-    t = 2 * np.pi * np.arange(256) / 256
-    q = 0.2 + 1.5 * np.cos(t + 0.3) + 0.25 * np.sin(3 * t)
-    k, limit = SLIDERS["stiffness"], SLIDERS["stiffness"] * SLIDERS["slip_displacement"]
-    own, before = np.zeros(3), 0.0
-    for _ in range(2):
-        last = []
-        for at in q.tolist():
-            own = np.clip(own + k * (at - before), -limit, limit)
-            before = at
-            last.append(np.sum(own - k * at))
-    whole = -law("slip_law").settled_states(jnp.asarray(q), jnp.zeros(256)) @ k
-    np.testing.assert_allclose(whole, last, rtol=0, atol=1e-12)
-    quick = law("slip_law").quick_cycle_force(jnp.asarray(q), jnp.zeros(256))
-    cycle = law("slip_law").cycle_force(jnp.asarray(q), jnp.zeros(256))
-    np.testing.assert_allclose(quick, cycle, rtol=0, atol=1e-12)
-
-
-def test_the_first_loading_of_a_slip_law_loses_what_has_slipped():
-    states, effect = law("slip_law").initial_states(), law("slip_law")
-    for q in np.linspace(0, 2, 101):
-        states = effect.moved_states(jnp.asarray(q), states)
-    lost = np.sum(SLIDERS["stiffness"] * np.maximum(2.0 - SLIDERS["slip_displacement"], 0))
-    assert float(effect.state_force(jnp.asarray(2.0), jnp.asarray(1.0), states)) == pytest.approx(
-        -lost, rel=1e-12
-    )
 
 
 def steady(extra, force, omega, cycles=120):
@@ -143,7 +102,7 @@ def test_a_model_with_a_law_returns_from_its_file_with_named_values(kind, tmp_pa
         np.testing.assert_array_equal(getattr(back, name), getattr(model.effects[0], name))
     names = [name for name in parameter_names(model) if name.startswith(kind)]
     values = {name.rpartition(".")[2].rpartition("_")[0] for name in names}
-    assert values == set(back.parameters()) - {"displacement", "velocity", "slip_displacement"}
+    assert values == set(back.parameters()) - {"displacement"}
     last = names[-1]
     other = with_parameters(model, [last], jnp.array([7.5]))
     assert float(parameter_value(other, last)) == 7.5
@@ -174,7 +133,7 @@ def test_refuses_a_file_whose_law_has_a_text_among_its_numbers(tmp_path):
     path = tmp_path / "model.toml"
     path.write_text(
         "[[mode]]\nfrequency_hz = 1\ndamping_ratio = 0.1\nshape = { a = 1 }\nparticipation = 1\n"
-        '[[effect]]\nkind = "damping_law"\nvelocity = [1, 2]\ndamping_force = [1, "2"]\n'
+        '[[effect]]\nkind = "stiffness_law"\ndisplacement = [1, 2]\nrestoring_force = [1, "2"]\n'
     )
-    with pytest.raises(ValueError, match=r"damping_force.*effect 1 of model.toml.*knot 2"):
+    with pytest.raises(ValueError, match=r"restoring_force.*effect 1 of model.toml.*knot 2"):
         read_model(path)

@@ -35,7 +35,6 @@ EFFECTS = {"slider": slider(), "iwan": iwan(), "iwan above 2": iwan(2.4), "coulo
 # One program each: run eagerly, every operation of every shape compiles on its own.
 averaged = eqx.filter_jit(averaged_effect)
 cycle = eqx.filter_jit(lambda effect, q, v: effect.cycle_force(q, v))
-quick_cycle = eqx.filter_jit(lambda effect, q, v: effect.quick_cycle_force(q, v))
 settled_states = eqx.filter_jit(lambda effect, q, v: effect.settled_states(q, v))
 
 
@@ -386,23 +385,3 @@ def test_jit_and_vmap_agree_and_trace_once(name):
     both = eqx.filter_vmap(lambda e: e.cycle_force(q, v))(many)
     np.testing.assert_allclose(both[0], cycle(effect, q, v), rtol=0, atol=rounding)
     assert not np.allclose(both[0], both[1])
-
-
-@pytest.mark.parametrize(
-    ("effect", "error"),
-    [
-        (slider(), 1e-13),
-        (slider(slip_displacement=2.0), 1e-13),  # which does not slip
-        (iwan(), 5e-4),  # the 48 sliders of the rule slip one after the other
-        (iwan(2.6), 5e-4),
-    ],
-)
-def test_the_quick_formula_holds_between_two_turning_points_and_nowhere_else(effect, error):
-    t = 2 * np.pi * np.arange(256) / 256
-    q = jnp.asarray(0.2 + 1.5 * np.cos(t + 0.3) + 0.1 * np.sin(2 * t))
-    v = jnp.zeros_like(q)  # friction knows the way alone
-    exact, quick = cycle(effect, q, v), quick_cycle(effect, q, v)
-    np.testing.assert_allclose(quick, exact, rtol=0, atol=error * max(np.max(np.abs(exact)), 1e-3))
-    assert np.all(np.isnan(quick_cycle(effect, *motion())))
-    assert type(effect).has_quick_formula()
-    assert not type(coulomb()).has_quick_formula()
