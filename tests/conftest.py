@@ -21,7 +21,9 @@ _QUICK = " ".join(
         "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
         # Another fifth: loops within loops are copied for every look into how often they turn and
         # what does not change in them, and what is known of memory is for optimisations alone.
-        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-trip-count-annotator",
+        # A tenth: operations are not divided among threads.
+        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-trip-count-annotator,"
+        "cpu-parallel-task-assigner",
         "--xla_llvm_enable_alias_scope_metadata=false --xla_llvm_enable_noalias_metadata=false",
         "--xla_llvm_enable_invariant_load_metadata=false",
     )

@@ -96,9 +96,12 @@ def test_expanded_structure_is_the_one_built_by_hand(parts, j, extra, frequencie
     )
 
 
-def test_without_a_further_mode_it_is_the_model_itself():
+def test_without_a_further_mode_it_is_the_model_without_its_name():
     model = coupled(DRAG)
+    named = dataclasses.replace(model, name="of some name")
+    assert model.name == ""
     assert simulated_structure(model) is model
+    assert eqx.tree_equal(simulated_structure(named), model)
 
 
 def test_force_of_the_coupling_and_its_slopes():
