@@ -14,7 +14,7 @@ import pytest
 
 _STORE = "JAX_COMPILATION_CACHE_DIR"
 _LEAST_TIME = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
-_ROOM = 3 * 2**30  # bytes of a worker, beyond which it forgets its programs
+_LEAST_ROOM = 3 * 2**30  # bytes that a worker may hold before it forgets its programs
 _QUICK = " ".join(
     (
         # Two thirds of the time, and by one thread: each worker has one core.
@@ -106,11 +106,23 @@ def optimised():
 def bounded_memory():
     """The programs of all modules together would fill gigabytes; the store has them on disk."""
     yield
-    if _memory() > _ROOM:
+    if _memory() > _room():
         import jax
 
         jax.clear_caches()
         _give_back()
+
+
+def _room() -> float:
+    """Bytes of a worker, beyond which it forgets its programs: half of the memory for all workers.
+
+    To forget takes seconds, and what is used again is traced again.
+    """
+    if not hasattr(os, "sysconf"):
+        return _LEAST_ROOM
+    whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    return max(_LEAST_ROOM, whole / 2 / workers)
 
 
 def _memory() -> float:

@@ -205,8 +205,7 @@ def _scan(backbone: Backbone, ratio: float) -> "_OnBackbone":
     largest = float(backbone.largest)
     at = _on_backbone(backbone, ratio * largest * np.linspace(0.0, 1.0, n))
     none_left = (at.amplitude > largest) & (at.damping <= 0)
-    *rows, argument = at
-    return _OnBackbone(*(row[: np.append(none_left, True).argmax()] for row in rows), argument)
+    return at.first(int(np.append(none_left, True).argmax()))
 
 
 class _OnBackbone(NamedTuple):
@@ -218,6 +217,11 @@ class _OnBackbone(NamedTuple):
     squared_slope: Float[np.ndarray, " point"]
     damping_slope: Float[np.ndarray, " point"]
     argument: Argument
+
+    def first(self, n: int) -> "_OnBackbone":
+        """The same at the first amplitudes."""
+        columns = {name: getattr(self, name)[:n] for name in self._fields[:-1]}
+        return self._replace(**columns)
 
     def participation(self, modes: LinearModes) -> Float[np.ndarray, " point"] | float:
         """`SensedMode.ratio` at the natural frequency."""
@@ -259,8 +263,10 @@ class _OnBackbone(NamedTuple):
 
 
 def _on_backbone(backbone: Backbone, amplitude: Float[np.ndarray, " point"]) -> _OnBackbone:
-    rows = by_blocks(lambda some: _values_and_slopes(backbone, some), _BLOCK, amplitude)
-    return _OnBackbone(amplitude, *rows, backbone.argument)
+    value, damping, slope, damping_slope = by_blocks(
+        lambda some: _values_and_slopes(backbone, some), _BLOCK, amplitude
+    )
+    return _OnBackbone(amplitude, value, damping, slope, damping_slope, backbone.argument)
 
 
 @compiled

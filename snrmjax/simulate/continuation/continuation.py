@@ -106,7 +106,7 @@ class CurveRange(NamedTuple):
     lower: Number
     upper: Number
     largest_amplitude: Number | None = None
-    most_points: Int[Array, ""] | None = None
+    most_points: Array | np.int64 | None = None
 
 
 class Curve(NamedTuple):
@@ -195,7 +195,7 @@ class CurveTracer(eqx.Module):
     within: CurveRange
     control: StepControl
     groups: tuple[int, int] | None = eqx.field(static=True, default=None)
-    may_close: bool | Bool[Array, ""] = True
+    may_close: bool | np.bool_ | Array = True
 
     def initial(self, start: Point, direction: Point, across: Point | None = None) -> Tracing:
         """The initial state: `start` is a guess, corrected at its own λ or across `across`."""
@@ -297,9 +297,9 @@ class CurveTracer(eqx.Module):
         step: Array,
     ) -> Int[Array, ""]:
         """Whether and how the curve has ended."""
-        lower, upper, largest_amplitude, most_points = self.within
+        lower, upper, largest_amplitude, limit = self.within
         is_first, is_end = state.aim == _FIRST, state.aim == _TO_END
-        most_points = self.control.max_points if most_points is None else most_points
+        most_points = jnp.asarray(self.control.max_points if limit is None else limit)
         large = jnp.array(False)
         if largest_amplitude is not None:
             large = jnp.max(jnp.abs(new[:-1])) > largest_amplitude

@@ -219,12 +219,12 @@ def trace_through(
 class _Way(NamedTuple):
     """How curves are traced; in arrays, so that all ways are one program."""
 
-    from_linear: Bool[Array, ""]  # response; else from given starts
-    downward: Bool[Array, ""]
-    may_close: Bool[Array, ""]
-    over_force: Bool[Array, ""]  # at the lower end of the range; else over the frequency
-    up_to: Float[Array, ""]  # times the force
-    most_points: Int[Array, ""]
+    from_linear: Array | np.bool_  # response; else from given starts
+    downward: Array | np.bool_
+    may_close: Array | np.bool_
+    over_force: Array | np.bool_  # at the lower end of the range; else over the frequency
+    up_to: Array | np.float64  # times the force
+    most_points: Array | np.int64
 
 
 def _traced(
@@ -239,8 +239,14 @@ def _traced(
     up_to: float | None = None,
 ) -> list[TracedCurve]:
     """Curves from given starts, or from the linear response; or over a force rising `up_to`."""
-    flags = np.array([starts is None, downward, may_close, up_to is not None])
-    way = _Way(*flags, np.float64(up_to or 1.0), np.int64(steps.max_points))
+    way = _Way(
+        from_linear=np.bool_(starts is None),
+        downward=np.bool_(downward),
+        may_close=np.bool_(may_close),
+        over_force=np.bool_(up_to is not None),
+        up_to=np.float64(up_to or 1.0),
+        most_points=np.int64(steps.max_points),
+    )
     common = (np.asarray(ends), dataclasses.replace(steps, max_points=_COUNTED), way)
     if starts is None:
         starts = np.zeros((len(balances.force), balances.size + 1))
