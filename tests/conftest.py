@@ -14,14 +14,16 @@ import pytest
 
 _STORE = "JAX_COMPILATION_CACHE_DIR"
 _LEAST_TIME = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
-_ROOM = 3 * 2**30  # bytes of a worker, beyond which it forgets its programs
+_LEAST_ROOM = 3 * 2**30  # bytes that a worker may hold before it forgets its programs
 _QUICK = " ".join(
     (
         # Two thirds of the time, and by one thread: each worker has one core.
         "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
         # Another fifth: loops within loops are copied for every look into how often they turn and
         # what does not change in them, and what is known of memory is for optimisations alone.
-        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-trip-count-annotator",
+        # A tenth: operations are not divided among threads.
+        "--xla_disable_hlo_passes=while-loop-invariant-code-motion,while-loop-trip-count-annotator,"
+        "cpu-parallel-task-assigner",
         "--xla_llvm_enable_alias_scope_metadata=false --xla_llvm_enable_noalias_metadata=false",
         "--xla_llvm_enable_invariant_load_metadata=false",
     )
@@ -104,11 +106,23 @@ def optimised():
 def bounded_memory():
     """The programs of all modules together would fill gigabytes; the store has them on disk."""
     yield
-    if _memory() > _ROOM:
+    if _memory() > _room():
         import jax
 
         jax.clear_caches()
         _give_back()
+
+
+def _room() -> float:
+    """Bytes of a worker, beyond which it forgets its programs: half of the memory for all workers.
+
+    To forget takes seconds, and what is used again is traced again.
+    """
+    if not hasattr(os, "sysconf"):
+        return _LEAST_ROOM
+    whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    return max(_LEAST_ROOM, whole / 2 / workers)
 
 
 def _memory() -> float:

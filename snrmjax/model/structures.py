@@ -294,16 +294,16 @@ def simulated_structure(model: Structure) -> Structure:
     """The structure to simulate, with the additional modes of its internal resonances.
 
     They come after the others, have no participation and no shape at the sensors.
-    Returns the model itself if no effect adds a mode.
+    Returns it without its name, which would otherwise be a part of compiled programs.
     """
     adding = [e for e in model.effects if isinstance(e, AbstractAddedMode)]
     if not adding:
-        return model
+        return dataclasses.replace(model, name="") if model.name else model
     modes, potential = model.modes, model.potential
     for effect in adding:
         modes, potential = effect.expanded(modes, potential)
     rest = tuple(e for e in model.effects if not isinstance(e, AbstractAddedMode))
-    return dataclasses.replace(model, modes=modes, potential=potential, effects=rest)
+    return dataclasses.replace(model, name="", modes=modes, potential=potential, effects=rest)
 
 
 def driven_in_newtons(model: Structure) -> Structure:

@@ -1,4 +1,4 @@
-"""An identification of other numbers, levels and knots compiles nothing anew."""
+"""An identification of other numbers, levels, knots and states compiles nothing anew."""
 
 import numpy as np
 from truths.exact_states import exact, modes
@@ -24,6 +24,16 @@ def test_points_and_curves_of_as_many_states(compilations):
     for seed, levels in ((1, 5), (2, 9), (3, 15)):
         again = sj.identify_backbone(states(seed, levels), modes())
         again.backbone.values(np.linspace(*(float(x) for x in ends(again)), 60 + seed))
+    assert len(compilations) == 0
+
+
+def test_points_of_other_numbers_of_states(compilations):
+    data = states(0, 5)
+    whole = np.asarray(sj.identify.identify_points(data, modes()).natural_frequency)
+    del compilations[:]
+    for n in (7, 20, len(data.level) - 1):
+        few = sj.identify.identify_points(data.select(np.arange(n)), modes())
+        np.testing.assert_array_equal(few.natural_frequency, whole[:n])
     assert len(compilations) == 0
 
 

@@ -227,7 +227,12 @@ def refit(fit: JointFit, changes: FitInputs) -> Unknowns:
     Reference: Griewank & Walther, Evaluating Derivatives (2008), ch. 15,
     doi:10.1137/1.9780898717761.
     """
-    return Unravel(fit.unknowns, fit.free)(_own(fit, _optimum(_Refit.of(fit).changed(changes))))
+    return Unravel(fit.unknowns, fit.free)(_own(fit, _refitted(_Refit.of(fit), changes)))
+
+
+@compiled
+def _refitted(refit: _Refit, changes: FitInputs) -> Array:
+    return _optimum(refit.changed(changes))
 
 
 def _own(fit: JointFit, point: Array | np.ndarray) -> Array:

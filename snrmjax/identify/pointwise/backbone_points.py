@@ -21,6 +21,7 @@ from snrmjax.identify.pointwise.snrm import (
 from snrmjax.measure.signals import appropriation_of, peak_amplitude
 from snrmjax.measure.states import SteadyStates, check_force, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import as_numpy, compiled
 from snrmjax.numerics.result import AbstractResult, Variable, quantity, setting
 from snrmjax.numerics.rules import InputError
@@ -134,7 +135,16 @@ def identify_points(
         raise InputError(
             '`measure="peak"` needs harmonics, but the steady states have the fundamental only.'
         )
-    return _identify(data, modes, reference_sensor(modes), amplitude, measure)
+    bare, settings = (
+        dataclasses.replace(data, notes=()),
+        (reference_sensor(modes), amplitude, measure),
+    )
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((data, modes))):
+        return _identify(bare, modes, *settings)
+    # With copies of the last state up to a power of two: few numbers of states compile.
+    n = data.n_states
+    points = _identify(bare.select(padded(np.arange(n))), modes, *settings)
+    return jax.tree.map(lambda column: jnp.asarray(np.asarray(column)[:n]), points)
 
 
 @compiled

@@ -13,7 +13,7 @@ from snrmjax.identify.curves.family_base import Argument
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.snrm import is_single, nonlinear_mode_velocity, sensed_mode
 from snrmjax.model.modes import LinearModes, residual_velocity
-from snrmjax.numerics.blocks import padded
+from snrmjax.numerics.blocks import by_blocks, padded
 from snrmjax.numerics.compiled import compiled, on_numbers
 from snrmjax.numerics.facts import Fact
 from snrmjax.numerics.result import AbstractResult, Variable, quantity
@@ -75,6 +75,7 @@ LARGEST_AMPLITUDE_RATIO = 1.5
 """Default end of predictions, as a multiple of the largest measured amplitude."""
 
 _SCAN = 4096  # amplitudes
+_BLOCK = 512  # amplitudes in one call of the program: any number of them compile once
 _ITERATIONS = 4  # fixed-point iterations of frequency and effective participation
 _SMALLEST = 0.02  # of its largest amplitude, where the main curve starts
 
@@ -103,13 +104,14 @@ def resonances(
     Reference: Kwarta & Allen, Eq. (19).
     """
     _require_force(force)
-    amplitude = _scan(backbone, largest_amplitude_ratio)
+    scan = _scan(backbone, largest_amplitude_ratio)
+    amplitude = scan.amplitude
     load = abs(float(backbone.modal_constant)) * force
 
     def too_weak(at: _OnBackbone) -> Bool[np.ndarray, " point"]:
         return np.signbit(at.excess(load * at.participation(modes)))
 
-    weak = too_weak(_on_backbone(backbone, amplitude))
+    weak = too_weak(scan)
     tips = []
     for k in np.flatnonzero(weak[:-1] != weak[1:]):
         if not weak[k] and amplitude[k] >= backbone.largest:
@@ -148,13 +150,14 @@ def predict_response(
     Reference: Kwarta & Allen, section 2.2 and Eq. (10).
     """
     _require_force(force)
-    scan = _scan(backbone, largest_amplitude_ratio)
+    at_scan = _scan(backbone, largest_amplitude_ratio)
+    scan = at_scan.amplitude
     load = abs(float(backbone.modal_constant)) * force
 
     def responds(at: _OnBackbone) -> Bool[np.ndarray, " point"]:
         return at.frequencies(load * at.participation(modes))[2] >= 0
 
-    inside = responds(_on_backbone(backbone, scan))
+    inside = responds(at_scan)
     starts = [scan[0]] if inside[0] else []
     ends: list[float] = []
     for k in np.flatnonzero(np.diff(inside.astype(int))):
@@ -191,17 +194,18 @@ def _require_force(force: float) -> None:
         raise InputError(f"`force` must be positive, but is {force!r} N.")
 
 
-def _scan(backbone: Backbone, ratio: float) -> Float[np.ndarray, " point"]:
-    """Amplitudes from zero to `ratio` times the largest measured one.
+def _scan(backbone: Backbone, ratio: float) -> "_OnBackbone":
+    """The backbone at amplitudes from zero to `ratio` times the largest measured one.
 
     Not beyond zero extrapolated damping: a passive structure has no negative damping.
     """
     if not ratio > 0 or not np.isfinite(ratio):
         raise InputError(f"`largest_amplitude_ratio` must be positive, but is {ratio!r}.")
     n = int(np.ceil(_SCAN * max(ratio / LARGEST_AMPLITUDE_RATIO, 1.0)))
-    scan = ratio * float(backbone.largest) * np.linspace(0.0, 1.0, n + 1)
-    none_left = (scan > float(backbone.largest)) & (_on_backbone(backbone, scan).damping <= 0)
-    return scan[: np.append(none_left, True).argmax()]
+    largest = float(backbone.largest)
+    at = _on_backbone(backbone, ratio * largest * np.linspace(0.0, 1.0, n))
+    none_left = (at.amplitude > largest) & (at.damping <= 0)
+    return at.first(int(np.append(none_left, True).argmax()))
 
 
 class _OnBackbone(NamedTuple):
@@ -213,6 +217,11 @@ class _OnBackbone(NamedTuple):
     squared_slope: Float[np.ndarray, " point"]
     damping_slope: Float[np.ndarray, " point"]
     argument: Argument
+
+    def first(self, n: int) -> "_OnBackbone":
+        """The same at the first amplitudes."""
+        columns = {name: getattr(self, name)[:n] for name in self._fields[:-1]}
+        return self._replace(**columns)
 
     def participation(self, modes: LinearModes) -> Float[np.ndarray, " point"] | float:
         """`SensedMode.ratio` at the natural frequency."""
@@ -254,7 +263,9 @@ class _OnBackbone(NamedTuple):
 
 
 def _on_backbone(backbone: Backbone, amplitude: Float[np.ndarray, " point"]) -> _OnBackbone:
-    value, damping, slope, damping_slope = map(np.asarray, _values_and_slopes(backbone, amplitude))
+    value, damping, slope, damping_slope = by_blocks(
+        lambda some: _values_and_slopes(backbone, some), _BLOCK, amplitude
+    )
     return _OnBackbone(amplitude, value, damping, slope, damping_slope, backbone.argument)
 
 
@@ -278,7 +289,7 @@ def _change(
 ) -> tuple[float, float]:
     """Bracket of the amplitude at which a condition changes, refined to rounding."""
     for _ in range(5):
-        fine = low + (high - low) * np.linspace(0.0, 1.0, _SCAN + 1)
+        fine = low + (high - low) * np.linspace(0.0, 1.0, _BLOCK)
         true = holds(_on_backbone(backbone, fine))
         k = max(int(np.argmin(true == true[0])), 1)
         low, high = fine[k - 1], fine[k]

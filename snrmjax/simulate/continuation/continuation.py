@@ -97,11 +97,16 @@ class StepControl(eqx.Module):
 
 
 class CurveRange(NamedTuple):
-    """Where a curve ends: the range of its last unknown, and the largest of the others."""
+    """Where a curve ends: the range of its last unknown, and the largest of the others.
+
+    With `most_points` it ends after so many points, with one program for any number of them,
+    instead of after `max_points` of its `StepControl`.
+    """
 
     lower: Number
     upper: Number
     largest_amplitude: Number | None = None
+    most_points: Array | np.int64 | None = None
 
 
 class Curve(NamedTuple):
@@ -190,7 +195,7 @@ class CurveTracer(eqx.Module):
     within: CurveRange
     control: StepControl
     groups: tuple[int, int] | None = eqx.field(static=True, default=None)
-    may_close: bool = eqx.field(static=True, default=True)
+    may_close: bool | np.bool_ | Array = True
 
     def initial(self, start: Point, direction: Point, across: Point | None = None) -> Tracing:
         """The initial state: `start` is a guess, corrected at its own λ or across `across`."""
@@ -234,7 +239,7 @@ class CurveTracer(eqx.Module):
 
     def assessed(self, state: Tracing) -> tuple[Tracing, Bool[Array, ""]]:
         """Accept or reject a finished trial and start the next; and whether it gave a point."""
-        control, trial, (lower, upper, _) = self.control, state.trial, self.within
+        control, trial, lower, upper = self.control, state.trial, *self.within[:2]
         here, tangent, new = state.here, state.tangent, trial.point
         is_first, is_end = state.aim == _FIRST, state.aim == _TO_END
         new_tangent = trial.tangent * jnp.where(trial.tangent @ tangent < 0, -1.0, 1.0)
@@ -249,15 +254,13 @@ class CurveTracer(eqx.Module):
         fraction = (end - here[-1]) / (new[-1] - here[-1])
         to_end = (here + fraction * (new - here)).at[-1].set(end)
 
-        closed = jnp.array(False)
-        if self.may_close:
-            passed = _passes(state, new, new_tangent, control.closing)
-            closed = good & (state.n_points > 4) & passed
-            new = jnp.where(closed, state.origin, new)
-            state = state._replace(
-                origin=jnp.where(is_first, new, state.origin),
-                origin_tangent=jnp.where(is_first, new_tangent, state.origin_tangent),
-            )
+        passed = _passes(state, new, new_tangent, control.closing)
+        closed = good & (state.n_points > 4) & passed & self.may_close
+        new = jnp.where(closed, state.origin, new)
+        state = state._replace(
+            origin=jnp.where(is_first, new, state.origin),
+            origin_tangent=jnp.where(is_first, new_tangent, state.origin_tangent),
+        )
         kept = good & ~leaving
         n_points = state.n_points + kept
         longer = jnp.minimum(
@@ -294,8 +297,9 @@ class CurveTracer(eqx.Module):
         step: Array,
     ) -> Int[Array, ""]:
         """Whether and how the curve has ended."""
-        lower, upper, largest_amplitude = self.within
+        lower, upper, largest_amplitude, limit = self.within
         is_first, is_end = state.aim == _FIRST, state.aim == _TO_END
+        most_points = jnp.asarray(self.control.max_points if limit is None else limit)
         large = jnp.array(False)
         if largest_amplitude is not None:
             large = jnp.max(jnp.abs(new[:-1])) > largest_amplitude
@@ -306,7 +310,7 @@ class CurveTracer(eqx.Module):
             (closed & kept, CurveStatus.CLOSED),
             (kept & ~is_first & large, CurveStatus.AMPLITUDE_LIMIT),
             (step < self.control.smallest, CurveStatus.STEP_TOO_SMALL),
-            (n_points >= self.control.max_points, CurveStatus.POINT_LIMIT),
+            (n_points >= most_points, CurveStatus.POINT_LIMIT),
         )
         status = jnp.array(RUNNING)
         for happened, what in reversed(ends):

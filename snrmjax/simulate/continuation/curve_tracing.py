@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -32,13 +32,11 @@ from snrmjax.simulate.continuation.continuation import (
     Tracing,
 )
 
-# From an end of the range; over a force that rises from zero to its value, or past it; or through
-# a given point.
-_Way = Literal["from_end", "rising", "past", "through"]
 _RISING_POINTS = 300  # over the force: longer curves wind around without reaching another motion
 _PAST = 4.0  # times the force, up to which a rising force is continued
 _NEAR = 5e-3  # distance in scaled unknowns below which a motion lies on a known curve
 _ALONE = 512  # points of a single curve in one call of the program
+_COUNTED = 2  # `max_points` of every program: its curves end after `CurveRange.most_points`
 
 
 def response_balances(
@@ -111,7 +109,7 @@ def under_rising_force(
     if rest is not None:  # the mean comes first among the coefficients
         initial[:, : rest.shape[1]] = rest / np.asarray(mine.displacement_scale)[:, None]
     at, steps = np.array([end, end]), _over_force(steps)
-    risen = _traced(mine, at, steps, initial, lanes, downward=False, way="rising")
+    risen = _traced(mine, at, steps, initial, lanes, downward=False, up_to=1.0)
     for start, curve in zip(starts, risen, strict=True):
         if curve.status == CurveStatus.UPPER_END:
             start[:-1] = curve.points[-1, :-1]
@@ -153,7 +151,7 @@ def at_force(
     """
     mine = taken(balances, np.array([member]))
     at, begin = np.array([frequency, frequency]), np.zeros((1, balances.size + 1))
-    (curve,) = _traced(mine, at, _over_force(steps), begin, lanes, downward=False, way="past")
+    (curve,) = _traced(mine, at, _over_force(steps), begin, lanes, downward=False, up_to=_PAST)
     beyond = curve.points[:, -1] > 1
     k = np.flatnonzero(beyond[1:] != beyond[:-1])
     here, there = curve.points[k], curve.points[k + 1]
@@ -215,7 +213,18 @@ def trace_through(
 ) -> list[TracedCurve]:
     """Curves through given scaled points, towards one end of the range (rad/s)."""
     starts = np.asarray(starts)
-    return _traced(balances, ends, steps, starts, 1, downward=downward, way="through")
+    return _traced(balances, ends, steps, starts, 1, downward=downward, may_close=True)
+
+
+class _Way(NamedTuple):
+    """How curves are traced; in arrays, so that all ways are one program."""
+
+    from_linear: Array | np.bool_  # response; else from given starts
+    downward: Array | np.bool_
+    may_close: Array | np.bool_
+    over_force: Array | np.bool_  # at the lower end of the range; else over the frequency
+    up_to: Array | np.float64  # times the force
+    most_points: Array | np.int64
 
 
 def _traced(
@@ -226,17 +235,28 @@ def _traced(
     lanes: int,
     *,
     downward: bool,
-    way: _Way = "from_end",
+    may_close: bool = False,
+    up_to: float | None = None,
 ) -> list[TracedCurve]:
-    """Curves from given starts, or from the linear response; or over a rising force."""
-    common = (np.asarray(ends), steps, np.array(downward))
+    """Curves from given starts, or from the linear response; or over a force rising `up_to`."""
+    way = _Way(
+        from_linear=np.bool_(starts is None),
+        downward=np.bool_(downward),
+        may_close=np.bool_(may_close),
+        over_force=np.bool_(up_to is not None),
+        up_to=np.float64(up_to or 1.0),
+        most_points=np.int64(steps.max_points),
+    )
+    common = (np.asarray(ends), dataclasses.replace(steps, max_points=_COUNTED), way)
+    if starts is None:
+        starts = np.zeros((len(balances.force), balances.size + 1))
     further, length = (_advanced_alone, _ALONE) if lanes == 1 else (_advanced_together, TOGETHER)
 
     def initial(jobs: tuple, wanted: Bool[np.ndarray, " lane"]) -> StateRows:
-        return _initial(jobs, wanted, *common, way=way)
+        return _initial(jobs, wanted, *common)
 
     def advanced(jobs: tuple, states: StateRows, idle: int) -> tuple:
-        return further(jobs, states, *common, np.array(idle), way=way, length=length)
+        return further(jobs, states, *common, np.array(idle), length=length)
 
     (status, n_solves), rows = in_lanes(initial, advanced, (balances, starts), lanes)
     curves = []
@@ -249,51 +269,47 @@ def _traced(
 def _tracer(balance: HarmonicBalance, ends: Array, steps: StepControl, way: _Way) -> CurveTracer:
     """Along the response, or at the lower end of the range over a rising force."""
     lower, upper = ends / balance.frequency_scale
-    if way not in ("rising", "past"):
-        groups, closes = (balance.n_coefficients, balance.model.n_modes), way == "through"
-        return CurveTracer(balance.linearised, CurveRange(lower, upper), steps, groups, closes)
     load = balance.newtons(lower) * balance.load()
 
     def linearised(point: Array) -> tuple[Array, Array]:
-        """Unknowns x and the fraction of the force."""
-        now = eqx.tree_at(lambda b: b.force, balance, balance.force * point[-1])
-        residual, jacobian = now.linearised(point.at[-1].set(lower))
-        return residual, jacobian.at[:, -1].set(-load)
+        """Unknowns x and the frequency, or the fraction of the force."""
+        last = point[-1]
+        factor, omega = jnp.where(way.over_force, jnp.array([last, lower]), jnp.array([1.0, last]))
+        now = eqx.tree_at(lambda b: b.force, balance, balance.force * factor)
+        residual, jacobian = now.linearised(point.at[-1].set(omega))
+        column = jnp.where(way.over_force, -load, jacobian[:, -1])
+        return residual, jnp.concatenate([jacobian[:, :-1], column[:, None]], axis=1)
 
-    return CurveTracer(
-        linearised,
-        CurveRange(lower=-1.0, upper=_PAST if way == "past" else 1.0),
-        steps,
-        None,
-        False,
+    within = CurveRange(
+        lower=jnp.where(way.over_force, -1.0, lower),
+        upper=jnp.where(way.over_force, way.up_to, upper),
+        most_points=way.most_points,
     )
+    # A harmonic may change sign over the force.
+    change = jnp.where(way.over_force, jnp.inf, steps.largest_change)
+    control = dataclasses.replace(steps, largest_change=change)
+    groups = balance.n_coefficients, balance.model.n_modes
+    return CurveTracer(linearised, within, control, groups, way.may_close)
 
 
-def _first(job: tuple, ends: Array, steps: StepControl, downward: Array, way: _Way) -> Tracing:
+def _first(job: tuple, ends: Array, steps: StepControl, way: _Way) -> Tracing:
     """The initial state of one job."""
     balance, start = job
-    if start is None:
-        begin = jnp.where(downward, ends[1], ends[0])
-        order = balance.harmonic_order
-        linear = linear_coefficients(balance.model, balance.force, begin, order)
-        start = balance.point(linear, begin)
-    sense = 1.0 if way in ("rising", "past") else jnp.where(downward, -1.0, 1.0)
+    begin = jnp.where(way.downward, ends[1], ends[0])
+    linear = linear_coefficients(balance.model, balance.force, begin, balance.harmonic_order)
+    start = jnp.where(way.from_linear, balance.point(linear, begin), start)
+    sense = jnp.where(way.downward & ~way.over_force, -1.0, 1.0)
     direction = jnp.zeros_like(start).at[-1].set(sense)
     return _tracer(balance, ends, steps, way).initial(start, direction)
 
 
 @compiled
 def _initial(
-    jobs: tuple,
-    wanted: Bool[Array, " lane"],
-    ends: Array,
-    steps: StepControl,
-    downward: Array,
-    way: _Way,
+    jobs: tuple, wanted: Bool[Array, " lane"], ends: Array, steps: StepControl, way: _Way
 ) -> StateRows:
     def initial(job: tuple, wanted: Array) -> Tracing:
         status = jnp.where(wanted, RUNNING, int(CurveStatus.NO_START))
-        return _first(job, ends, steps, downward, way)._replace(status=status)
+        return _first(job, ends, steps, way)._replace(status=status)
 
     return in_rows(jax.vmap(initial)(jobs, wanted))
 
@@ -303,9 +319,8 @@ def _advanced(
     states: StateRows,
     ends: Array,
     steps: StepControl,
-    downward: Array,
-    idle: Int[Array, ""],
     way: _Way,
+    idle: Int[Array, ""],
     length: int,
 ) -> tuple[StateRows, tuple, tuple]:
     def result(state: Tracing) -> tuple:
@@ -316,7 +331,7 @@ def _advanced(
         state, kept = tracer.corrected(state) if length == _ALONE else tracer.advanced(state)
         return state, (kept, state.here, state.tangent)
 
-    initial = partial(_first, ends=ends, steps=steps, downward=downward, way=way)
+    initial = partial(_first, ends=ends, steps=steps, way=way)
     return iterated(initial, step, result, jobs, states, length, idle)
 
 

@@ -87,7 +87,7 @@ def test_a_strong_law_is_named_without_a_remainder(law, smallest, kind, part):
 
 
 def test_a_preload_on_a_known_cubic_spring_is_named_with_its_force():
-    """The spring is the model's own; the mean displacement, 0.3 of the amplitude, is not recorded."""
+    """The model's own spring; the mean displacement, 0.3 of the amplitude, is not recorded."""
     cubic = 0.04 * OMEGA**2 * (SHAPE / LARGEST) ** 2
     static = 0.3 * LARGEST / SHAPE
     preload = OMEGA**2 * static + cubic * static**3

@@ -94,6 +94,7 @@ def test_conditions_are_met_and_differentiated(condition, curve):
     start, value = start_and_value(curve, condition)
     n = sum(values.size for values in numbers(model))
 
+    @jax.jit
     def motion(shifts):
         """All numbers of the model, the force and the value are shifted."""
         given = None if value is None else value * (1 + shifts[n + 1])
@@ -109,12 +110,12 @@ def test_conditions_are_met_and_differentiated(condition, curve):
         found = motion(shifts)
         return jnp.stack([found.frequency, found.amplitude, found.coefficients[2, 0]])
 
-    def everything(shifts):
-        forward, reverse = jax.jacfwd(quantities)(shifts), jax.jacrev(quantities)(shifts)
-        return motion(shifts), forward, reverse
+    @jax.jit
+    def slopes(shifts):
+        return jax.jacfwd(quantities)(shifts), jax.jacrev(quantities)(shifts)
 
     zero = np.zeros(n + 2)
-    found, forward, reverse = jax.jit(everything)(zero)
+    found, (forward, reverse) = motion(zero), slopes(zero)
     assert bool(found.converged)
     if condition == "frequency":
         assert float(found.frequency) == pytest.approx(value, rel=1e-14)
@@ -130,7 +131,7 @@ def test_conditions_are_met_and_differentiated(condition, curve):
     forward, reverse = np.asarray(forward), np.asarray(reverse)
     scale = np.abs(forward).max(axis=1, keepdims=True)
     np.testing.assert_allclose(reverse / scale, forward / scale, rtol=0, atol=1e-11)
-    slope = by_differences(jax.jit(quantities), zero, 1e-4)
+    slope = by_differences(quantities, zero, 1e-4)
     # Fourth order in 1e-4, and Newton's rounding 1e-13 over it. The force of the slider is
     # piecewise linear in the samples: where one of 256 changes side its slope jumps by 1e-6.
     np.testing.assert_allclose(forward / scale, slope / scale, rtol=0, atol=1e-6)

@@ -52,16 +52,19 @@ def fold():
     return TrackedMotion(oscillator(), FORCE, start, condition="fold"), start
 
 
-def test_a_fold_is_continued_to_where_a_fixed_start_finds_another(fold):
-    tracked, start = fold
+@pytest.fixture(scope="module")
+def found(fold):
+    """Frequencies of the fold and their slopes by the cubic coefficients, of four at once."""
+    tracked, _ = fold
 
-    @jax.jit
-    def found(cubics):
-        def at(cubic):
-            return tracked.at(oscillator(cubic)).frequency
+    def at(cubic):
+        return tracked.at(oscillator(cubic)).frequency
 
-        return jax.vmap(jax.value_and_grad(at))(cubics)
+    return jax.jit(jax.vmap(jax.value_and_grad(at)))
 
+
+def test_a_fold_is_continued_to_where_a_fixed_start_finds_another(fold, found):
+    _, start = fold
     cubics = CUBIC * np.array([0.6, 6.0, 30.0, 100.0])
     frequency, slope = found(cubics)
     for k, cubic in enumerate(cubics):
@@ -73,26 +76,26 @@ def test_a_fold_is_continued_to_where_a_fixed_start_finds_another(fold):
     assert not abs(float(fixed.frequency) / float(frequency[3]) - 1) < 0.1  # the lower fold, or NaN
 
 
-def test_an_optimisation_arrives_at_the_fold_that_is_asked_for(fold):
-    tracked, _ = fold
+def test_an_optimisation_arrives_at_the_fold_that_is_asked_for(found):
     wanted = upper_fold(12.0 * CUBIC)
 
-    @jax.jit
     def miss(logarithm):
-        motion = tracked.at(oscillator(CUBIC * jnp.exp(logarithm[0])))
-        return motion.frequency[None] / wanted - 1
+        return np.asarray(found(np.repeat(CUBIC * np.exp(logarithm), 4))[0])[:1] / wanted - 1
 
-    found = least_squares(miss, [0.0], jac=jax.jit(jax.jacobian(miss)), gtol=1e-12)
-    assert found.success
-    assert np.exp(found.x[0]) == pytest.approx(12.0, rel=1e-8)
+    def slope(logarithm):
+        cubic = CUBIC * np.exp(logarithm)
+        return np.asarray(found(np.repeat(cubic, 4))[1])[:1, None] * cubic / wanted
+
+    arrived = least_squares(miss, [0.0], jac=slope, gtol=1e-12)
+    assert arrived.success
+    assert np.exp(arrived.x[0]) == pytest.approx(12.0, rel=1e-8)
 
 
-def test_where_the_motion_ends_on_the_way_all_is_nan(fold):
-    tracked, _ = fold
+def test_where_the_motion_ends_on_the_way_all_is_nan(found):
     # Almost linear: both folds have met in a cusp before.
-    value, slope = jax.value_and_grad(lambda c: tracked.at(oscillator(c)).frequency)(1e-3 * CUBIC)
-    assert np.isnan(value)
-    assert np.isnan(slope)
+    value, slope = found(np.full(4, 1e-3 * CUBIC))
+    assert np.all(np.isnan(value))
+    assert np.all(np.isnan(slope))
 
 
 def test_what_cannot_be_continued_is_refused(fold):
