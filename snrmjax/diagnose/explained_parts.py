@@ -13,8 +13,8 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.kinds.registry import hypothesis_of
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import test_states_of
-from snrmjax.diagnose.naming.columns import parameters_of
-from snrmjax.diagnose.naming.hypotheses import best_hypotheses, hypotheses_of
+from snrmjax.diagnose.naming.columns import Column, parameters_of
+from snrmjax.diagnose.naming.hypotheses import best_hypotheses, hypotheses_of, with_rivals
 from snrmjax.diagnose.naming.parts import Naming, naming_of
 from snrmjax.diagnose.naming.phases import likely_dynamic_stiffness
 from snrmjax.diagnose.naming.rows import Cell, Problem, solved
@@ -39,7 +39,7 @@ from snrmjax.numerics.blocks import padded
 
 _ANY_PHASE = 1.0  # rad, 1σ of an unrecorded phase about its estimate
 _PASSES = 2  # of harmonic balance at the strengths
-_BALANCED = 24  # columns that are made exact by harmonic balance
+_BALANCED = 30  # columns that are made exact by harmonic balance
 _BY_HARMONICS = 0.04  # x³: its third harmonic is 1/24 of the motion per unit of stiffness change
 
 
@@ -76,54 +76,70 @@ def named_parts(predictions: Predictions, data: SteadyStates, kinds: Iterable[st
         kinds = [k for k in kinds if not hypothesis_of(k).only_phase]
     problem, cells = best_hypotheses(readings, kinds)
     for _ in range(0 if unknown.any() else _PASSES):
-        balanced = _with_balanced_laws(problem, cells, predictions, data)
-        if balanced is None:
+        if not _is_strong(problem, cells[0]):
             break
+        balanced = _with_balanced_laws(problem, with_rivals(problem, cells), predictions, data)
         problem, cells = balanced, hypotheses_of(balanced)
     return NamedParts(naming_of(problem, cells), problem)
 
 
-def _with_balanced_laws(
-    problem: Problem, cells: list[Cell], predictions: Predictions, data: SteadyStates
-) -> Problem | None:
-    """The problem with strong laws as harmonic balance has them; None without strong laws.
+def _is_strong(problem: Problem, cell: Cell) -> bool:
+    """Whether describing functions of a hypothesis' laws are less exact than the readings.
 
     A law excites harmonics of the motion, which change its force at the fundamental: by about
-    θ²/25 of the linear stiffness for a law that changes it by θ. The columns of the most probable
-    hypotheses become exact for their strengths in these.
+    θ²/25 of the linear stiffness for a law that changes it by θ.
     """
     readings, unit = problem.readings, problem.readings.natural_frequency**2
-    laws: dict[int, tuple[dict[str, float], float]] = {}  # parameters and strengths, by column
-    strong = False
+    strengths = solved(problem, cell).mean[: len(cell.columns)]
+    errors = [
+        readings.whitened(_BY_HARMONICS * strength**2 * unit * problem.columns[k].change)
+        for k, strength in zip(cell.columns, strengths, strict=True)
+        if issubclass(EFFECTS[problem.columns[k].kind], AbstractForce)
+    ]
+    return any(np.linalg.norm(error) > priors.VISIBLE for error in errors)
+
+
+def _with_balanced_laws(
+    problem: Problem, cells: list[Cell], predictions: Predictions, data: SteadyStates
+) -> Problem:
+    """The problem with laws as harmonic balance has them.
+
+    The columns of the first hypotheses, and of shapes next to those of the first one, become exact
+    for their strengths.
+    """
+    readings, unit = problem.readings, problem.readings.natural_frequency**2
+    strengths: dict[int, float] = {}
+    columns = list(problem.columns)
     for cell in cells:
-        own = [
-            k for k in cell.columns if issubclass(EFFECTS[problem.columns[k].kind], AbstractForce)
-        ]
-        if len(laws) >= _BALANCED or {*own} <= laws.keys():
+        own = [k for k in cell.columns if issubclass(EFFECTS[columns[k].kind], AbstractForce)]
+        if len(strengths) >= _BALANCED or {*own} <= strengths.keys():
             continue
         mean = solved(problem, cell).mean
         for k in own:
-            column, strength = problem.columns[k], float(mean[cell.columns.index(k)])
-            low, high = column.limits
-            parameters = (
-                parameters_of(readings, column, strength) if low < strength < high else None
-            )
-            if k in laws or not parameters:
-                continue
-            laws[k] = {f"{column.kind}.{name}": v for name, v in parameters.items()}, strength
-            error = readings.whitened(_BY_HARMONICS * strength**2 * unit * column.change)
-            strong |= bool(np.linalg.norm(error) > priors.VISIBLE)
-    if not strong:
-        return None
-    changes = _balanced_changes(readings, predictions, data, [law for law, _ in laws.values()])
-    exact = {
-        k: problem.columns[k]._replace(change=change / (strength * unit), widths=())
-        for (k, (_, strength)), change in zip(laws.items(), changes, strict=True)
+            strength = float(mean[cell.columns.index(k)])
+            strengths.setdefault(k, strength)
+            if cell is cells[0]:
+                next_to = columns[k].neighbours(readings)
+                first = len(columns)
+                strengths |= dict.fromkeys(range(first, first + len(next_to)), strength)
+                columns += next_to
+    laws = {k: _law_at(readings, columns[k], strength) for k, strength in strengths.items()}
+    laws = {k: law for k, law in laws.items() if law}
+    changes = _balanced_changes(readings, predictions, data, list(laws.values()))
+    exact = [
+        columns[k]._replace(change=change / (strengths[k] * unit))
+        for k, change in zip(laws, changes, strict=True)
         if np.isfinite(change).all()
-    }
-    kinds = {column.kind for column in exact.values()}
-    others = [column for column in problem.columns if column.kind not in kinds]
-    return problem.with_columns([*exact.values(), *others])
+    ]
+    kinds = {column.kind for column in exact}
+    return problem.with_columns([*exact, *(c for c in problem.columns if c.kind not in kinds)])
+
+
+def _law_at(readings: Readings, column: Column, strength: float) -> dict[str, float]:
+    """Parameters of a column's law by name; none where it cannot have this strength."""
+    low, high = column.limits
+    parameters = parameters_of(readings, column, strength) if low < strength < high else None
+    return {f"{column.kind}.{name}": value for name, value in (parameters or {}).items()}
 
 
 def _balanced_changes(
