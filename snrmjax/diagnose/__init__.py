@@ -12,6 +12,7 @@
 5. `naming.rows` sets up the linear problem, `naming.evidence` has the evidence of laws in closed
    form, and `naming.hypotheses` compares single laws, pairs, and larger sets grown from the best
    of these, over a grid of remainder standard deviations; it refines the shapes that matter.
+   `explained_parts` replaces strong laws by their harmonic balance and compares them again.
    `naming.parts` turns these hypotheses into an answer by parts: laws with their probability, the
    fraction of the change that they explain, and the remainder.
 6. `answer_by_parts` fits the named laws together by harmonic balance at the measured motions
