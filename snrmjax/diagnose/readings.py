@@ -149,6 +149,15 @@ class Readings(NamedTuple):
         """Ω/ω₀."""
         return self.frequency / self.natural_frequency
 
+    @property
+    def frequency_over_level(self) -> Float[np.ndarray, " state"]:
+        """Ω over the natural frequency of the state's level, as smooth curves estimate its error.
+
+        With it the motion's other harmonics respond, where warming changes the whole structure.
+        """
+        stiffness = self.posterior.level_errors[self.posterior.states.level, 2]
+        return self.relative_frequency / np.sqrt(1 + stiffness)
+
     def whitened(
         self, change: Complex[np.ndarray, "*several state"]
     ) -> Float[np.ndarray, "*several row"]:

@@ -56,7 +56,7 @@ def of_force(force: Callable[..., np.ndarray]) -> tuple[Change, Change]:
 
 def quadratic_change(r: Readings, log_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Of a force s q², and the second harmonic of the motion."""
-    x, omega = r.relative_amplitude, r.relative_frequency
+    x, omega = r.relative_amplitude, r.frequency_over_level
     return describing.quadratic(x, omega, r.damping_ratio, np.exp(log_s))
 
 
@@ -64,7 +64,7 @@ def bilinear_change(r: Readings, log_k: float) -> tuple[np.ndarray, np.ndarray]:
     """Of k|q|/2, by the mean −ka/π and the second harmonic 2ka/(3π) of the motion."""
     k = np.exp(log_k)
     twice = 2 * k / (3 * np.pi) * np.ones_like(r.dynamic_stiffness)
-    return -2 * (k / np.pi) ** 2 + twice**2 / (4 * r.relative_frequency**2 - 1), twice
+    return -2 * (k / np.pi) ** 2 + twice**2 / (4 * r.frequency_over_level**2 - 1), twice
 
 
 def preload_change(r: Readings, log_static: float) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +76,7 @@ def preload_change(r: Readings, log_static: float) -> tuple[np.ndarray, np.ndarr
     square = 3 * cubic_of_model(r) * static  # of a force square × q²
     if square == 0:
         return 0 * r.dynamic_stiffness, 0 * r.dynamic_stiffness
-    x, omega = r.relative_amplitude, r.relative_frequency
+    x, omega = r.relative_amplitude, r.frequency_over_level
     change, twice = describing.quadratic(x, omega, r.damping_ratio, abs(square))
     return square * static + change, np.sign(square) * twice
 
@@ -119,7 +119,7 @@ def resonance_change(order: int) -> Change:
     def change(r: Readings, detuning: float, log_times: float) -> np.ndarray:
         ratio = np.exp(log_times) * max(r.damping_ratio, 1e-4)
         return describing.resonant(
-            r.relative_amplitude, r.relative_frequency, order, detuning, ratio
+            r.relative_amplitude, r.frequency_over_level, order, detuning, ratio
         )
 
     return change
