@@ -215,10 +215,10 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
     assert written["gap"]["after"] == pytest.approx(1.0, abs=0.2)
     limits = written["detection_limits"]
     # Without phases, phase errors are invisible, and so are effects that only show in harmonics,
-    # whose phases are relative to the fundamental; a preload is searched with other effects only.
+    # whose phases are relative to the fundamental.
     unlimited = {
         *("sensor_phase_error", "close_mode", "internal_resonance_1_2", "internal_resonance_1_3"),
-        *("force_harmonics", "mode_shape_change", "static_preload"),
+        *("force_harmonics", "mode_shape_change"),
     }
     assert {name.split(".")[0] for name in limits} == set(EFFECTS) - unlimited
     assert all(0 < limit < np.inf for limit in limits.values())
