@@ -49,7 +49,8 @@ class LawSums(NamedTuple):
     level_std: LevelStds
     base: float  # ln p of the rows without any law, times the prior of `remainder_std`
     b: Float[np.ndarray, " column"]
-    gram: Float[np.ndarray, "column column"]
+    square: Float[np.ndarray, " column"]  # diagonal of S
+    gram: Float[np.ndarray, "column column"]  # S; empty for laws alone
     kind: np.ndarray  # of every column
     low: Float[np.ndarray, " column"]  # limits of the strength
     high: Float[np.ndarray, " column"]
@@ -63,13 +64,22 @@ class LawSums(NamedTuple):
         block: RowBlock,
         remainder_std: RemainderStds,
         levels: tuple[LevelStds, float] = (WITHOUT_LAWS, 0.0),
+        *,
+        alone: bool = False,
     ) -> "LawSums":
-        """From one Cholesky factor; `levels`: 1σ of level errors, and ln of their prior."""
+        """From one Cholesky factor; `levels`: 1σ of level errors, and ln of their prior.
+
+        `alone`: for hypotheses of one law.
+        """
         root = block.triangle * np.sqrt(block.variances(remainder_std, levels[0]))
         factor = cholesky(root @ root.T + np.eye(len(root)), lower=True)
         white = solve_triangular(factor, block.along, lower=True)
-        gram = block.across + white.T @ white
-        base = -0.5 * float(gram[-1, -1]) - float(np.sum(np.log(np.diag(factor))))
+        square = np.diag(block.across) + np.sum(white**2, axis=0)
+        b = block.across[:-1, -1] + white[:, :-1].T @ white[:, -1]
+        gram = np.empty((0, 0))
+        if not alone:
+            gram = block.across[:-1, :-1] + white[:, :-1].T @ white[:, :-1]
+        base = -0.5 * float(square[-1]) - float(np.sum(np.log(np.diag(factor))))
         kinds = [column.kind for column in columns]
         odds = {kind: hypothesis_of(kind).odds for kind in dict.fromkeys(kinds)}
         every = sum(odds.values())
@@ -80,8 +90,9 @@ class LawSums(NamedTuple):
             remainder_std,
             levels[0],
             base + _log_prior(remainder_std) + levels[1],
-            gram[:-1, -1],
-            gram[:-1, :-1],
+            b,
+            square[:-1],
+            gram,
             np.array(kinds),
             low,
             high,
@@ -95,6 +106,7 @@ class LawSums(NamedTuple):
             remainder_std=(*self.remainder_std, *other.remainder_std),
             base=self.base + other.base,
             b=self.b + other.b,
+            square=self.square + other.square,
             gram=self.gram + other.gram,
         )
 
@@ -107,7 +119,7 @@ class LawSums(NamedTuple):
 
     def bound(self) -> Float[np.ndarray, "column column"]:
         """Upper bound of a pair's ln likelihood, ½ bᵀS⁻¹b plus base; prior 1σ is at most 1."""
-        s = np.diag(self.gram) + 1.0
+        s = self.square + 1.0
         both = np.multiply.outer(s, s)
         across = np.maximum(both - self.gram**2, 1e-9 * both)
         square = np.multiply.outer(self.b**2, s)
@@ -157,8 +169,8 @@ class LawSums(NamedTuple):
         wide = np.where(np.isnan(self.std[own]), 1.0, self.std[own])
         known = np.linalg.solve(self.gram[np.ix_(own, own)] + np.diag(wide**-2.0), self.gram[own])
         b = self.b - known.T @ self.b[own]
-        square = np.diag(self.gram) - np.sum(known * self.gram[own], axis=0)
-        smallest = _ALIKE * np.diag(self.gram)
+        square = self.square - np.sum(known * self.gram[own], axis=0)
+        smallest = _ALIKE * self.square
         apart, square = square > smallest, np.maximum(square, smallest)
         value = self.gains(b, square, 2) + np.log(n_laws * self.prior)
         value += cell.log_evidence + np.log(
@@ -193,7 +205,7 @@ class LawSums(NamedTuple):
         Excluded (−∞) are pairs with an insignificant law, which amount to the other law alone, and
         pairs whose laws differ by less than the error of describing functions.
         """
-        s, t, b, c, g = *np.diag(self.gram)[[i, j]], *self.b[[i, j]], self.gram[i, j]
+        s, t, b, c, g = *self.square[[i, j]], *self.b[[i, j]], self.gram[i, j]
         s, t = s + 1.0, t + 1.0
         both = (b * b * t + c * c * s - 2 * g * b * c) / np.maximum(s * t - g * g, 1e-9 * s * t)
         first, second = both - c * c / t, both - b * b / s  # gain of one given the other
@@ -234,8 +246,7 @@ class HarmonicSums(NamedTuple):
         some = [one for one in higher if one is not None]
         if not some:
             return cls(np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1)))
-        squares = np.array([np.diag(one.gram) for one in some])
-        return cls(np.array([one.base for one in some]), np.array([o.b for o in some]), squares)
+        return cls(*(np.array([getattr(one, name) for one in some]) for name in cls._fields))
 
     def singles(self, own: LawSums) -> tuple[np.ndarray, np.ndarray]:
         """ln evidence without a law, and of every law alone: (combination,), (combination, column).
@@ -243,7 +254,7 @@ class HarmonicSums(NamedTuple):
         Includes the rows of the fundamentals.
         """
         base = own.base + self.base
-        value = own.gains(own.b + self.b, np.diag(own.gram) + self.square, 1) + np.log(own.prior)
+        value = own.gains(own.b + self.b, own.square + self.square, 1) + np.log(own.prior)
         value = value + base[:, None] + np.log(priors.EFFECT_COUNTS[1])
         return base + np.log(priors.EFFECT_COUNTS[0]), value
 
@@ -284,7 +295,7 @@ def detectable_strengths(problem: Problem, cell: Cell, nats: float) -> Float[np.
     some, n_rows = list(cell.columns), sum(len(block.rows) for block in problem.blocks)
     across = normal.gram[:, some]
     known = across @ np.linalg.pinv(normal.gram[np.ix_(some, some)], hermitian=True)
-    precision = np.diag(normal.gram) - np.sum(known * across, axis=1)
+    precision = normal.square - np.sum(known * across, axis=1)
     # Δχ² ≥ `nats` for the choice and ln n for one parameter (Schwarz).
     need = nats + np.log(n_rows)
     return np.sqrt(need / np.maximum(precision, 1e-12))

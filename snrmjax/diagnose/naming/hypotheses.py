@@ -145,7 +145,7 @@ def _level_errors_with(
         sums = LawSums.of(alone.columns, own, cell.remainder_std[:2], (stds(logs), log_prior(logs)))
         whole = functools.reduce(LawSums.with_rows_of, higher, sums)
         if len(cell.columns) == 1:
-            return -whole.base - float(whole.gains(whole.b, np.diag(whole.gram), 1)[0])
+            return -whole.base - float(whole.gains(whole.b, whole.square, 1)[0])
         together = whole.together(tuple(range(len(cell.columns))))
         return _UNSEEN if together is None else -together.log_evidence
 
@@ -203,16 +203,16 @@ class _Grid(NamedTuple):
     higher: list[LawSums | None]
 
     @classmethod
-    def of(cls, problem: Problem, every: int) -> "_Grid":
-        """With each `every`-th standard deviation of the remainders."""
-        stds = remainder_stds(every)
+    def of(cls, problem: Problem, every: int, *, alone: bool = False) -> "_Grid":
+        """With each `every`-th standard deviation of the remainders; `alone`: for single laws."""
+        stds, few = remainder_stds(every), {*remainder_stds(2)}
         own, *others = problem.blocks
         sums = [
-            LawSums.of(problem.columns, own, both, levels)
+            LawSums.of(problem.columns, own, both, levels, alone=alone or not {*both} <= few)
             for both in itertools.product(stds, stds)
             for levels in problem.level_stds
         ]
-        return cls(sums, _of_harmonics(problem.columns, others, every))
+        return cls(sums, _of_harmonics(problem.columns, others, every, alone=alone))
 
     def singles(self) -> Iterator[tuple[list[Cell], np.ndarray]]:
         """Hypotheses without a law, and ln evidence of every law alone, by combination."""
@@ -236,7 +236,7 @@ def _log_evidence_of_singles(problem: Problem) -> float:
     """ln of the probability of the rows with one law or none."""
     each = [
         np.append(value, [cell.log_evidence for cell in none])
-        for none, value in _Grid.of(problem, 2).singles()
+        for none, value in _Grid.of(problem, 2, alone=True).singles()
     ]
     return float(logsumexp(np.concatenate(each)))
 
@@ -311,13 +311,13 @@ def _with_one_more(cells: list[Cell], grid: _Grid, n_laws: int, least: float) ->
 
 
 def _of_harmonics(
-    columns: list[Column], blocks: list[RowBlock], every: int
+    columns: list[Column], blocks: list[RowBlock], every: int, *, alone: bool
 ) -> "list[LawSums | None]":
     """Sums of all other harmonics, for all combinations of remainders."""
     if not blocks:
         return [None]
     stds = [(std,) for std in priors.HARMONIC_REMAINDERS[::every].tolist()]
-    each = [[LawSums.of(columns, block, std) for std in stds] for block in blocks]
+    each = [[LawSums.of(columns, block, std, alone=alone) for std in stds] for block in blocks]
     return [
         functools.reduce(lambda one, other: one.with_rows_of(other), some)
         for some in itertools.product(*each)
