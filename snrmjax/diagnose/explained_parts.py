@@ -104,25 +104,18 @@ def _with_balanced_laws(
 ) -> Problem:
     """The problem with laws as harmonic balance has them.
 
-    The columns of the first hypotheses, and of shapes next to those of the first one, become exact
-    for their strengths.
+    The columns of the first hypotheses become exact for their strengths.
     """
     readings, unit = problem.readings, problem.readings.natural_frequency**2
     strengths: dict[int, float] = {}
-    columns = list(problem.columns)
+    columns = problem.columns
     for cell in cells:
         own = [k for k in cell.columns if issubclass(EFFECTS[columns[k].kind], AbstractForce)]
         if len(strengths) >= _BALANCED or {*own} <= strengths.keys():
             continue
         mean = solved(problem, cell).mean
         for k in own:
-            strength = float(mean[cell.columns.index(k)])
-            strengths.setdefault(k, strength)
-            if cell is cells[0]:
-                next_to = columns[k].neighbours(readings)
-                first = len(columns)
-                strengths |= dict.fromkeys(range(first, first + len(next_to)), strength)
-                columns += next_to
+            strengths.setdefault(k, float(mean[cell.columns.index(k)]))
     laws = {k: _law_at(readings, columns[k], strength) for k, strength in strengths.items()}
     laws = {k: law for k, law in laws.items() if law}
     changes = _balanced_changes(readings, predictions, data, list(laws.values()))
@@ -132,7 +125,7 @@ def _with_balanced_laws(
         if np.isfinite(change).all()
     ]
     kinds = {column.kind for column in exact}
-    return problem.with_columns([*exact, *(c for c in problem.columns if c.kind not in kinds)])
+    return problem.with_columns([*exact, *(c for c in columns if c.kind not in kinds)])
 
 
 def _law_at(readings: Readings, column: Column, strength: float) -> dict[str, float]:

@@ -48,15 +48,6 @@ class Column(NamedTuple):
             parts += _column(readings, self.kind, shape, self.fraction / _PARTS**n, widths)
         return parts
 
-    def neighbours(self, readings: Readings) -> "list[Column]":
-        """Columns of shapes one and three of its widths away, along each of its axes."""
-        columns = []
-        for k, width in enumerate(self.widths):
-            for step in (-3, -1, 1, 3):
-                shape = (*self.shape[:k], self.shape[k] + step * width, *self.shape[k + 1 :])
-                columns += _column(readings, self.kind, shape, self.fraction, self.widths)
-        return columns
-
     def exact_at(self, readings: Readings, strength: float) -> "Column":
         """The column with the change exact for a strength within its limits, where that matters."""
         value = float(np.clip(strength, *self.limits)) * (hypothesis_of(self.kind).unit or 0.0)
