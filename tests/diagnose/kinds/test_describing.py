@@ -16,6 +16,7 @@ RATIO = 0.01
 READINGS = SimpleNamespace(
     relative_amplitude=X,
     relative_frequency=OMEGA,
+    frequency_over_level=OMEGA,
     damping_ratio=RATIO,
     dynamic_stiffness=np.ones(len(X), complex),
 )
