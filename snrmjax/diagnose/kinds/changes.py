@@ -82,7 +82,7 @@ def preload_change(r: Readings, log_static: float) -> tuple[np.ndarray, np.ndarr
 
 
 def preload(r: Readings, strength: float, log_static: float, side: float) -> tuple[float]:
-    """The constant force that displaces the mode, at a strength that goes with its square."""
+    """The constant force at a strength, which goes with the square of the static displacement."""
     static = side * np.exp(log_static) * np.sqrt(max(strength, 0.0))
     force = static + cubic_of_model(r) * static**3
     return (float(-force * r.natural_frequency**2 * r.largest),)
@@ -107,10 +107,8 @@ def second_harmonic_of(law: Callable[[Readings, float], tuple[np.ndarray, np.nda
 
 def at_stop(q: np.ndarray, _: np.ndarray, width: float, log_k: float) -> np.ndarray:
     """Force of a one-sided stop about the mean displacement that it causes."""
-    largest = np.max(np.abs(q), axis=1)
-    return np.maximum(
-        q + describing.mean_at_stop(largest, width, np.exp(log_k))[:, None] - width, 0
-    )
+    mean = describing.mean_at_stop(np.max(np.abs(q), axis=1), width, np.exp(log_k))
+    return np.maximum(q + mean[:, None] - width, 0.0)
 
 
 def resonance_change(order: int) -> Change:

@@ -246,7 +246,11 @@ class HarmonicSums(NamedTuple):
         some = [one for one in higher if one is not None]
         if not some:
             return cls(np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1)))
-        return cls(*(np.array([getattr(one, name) for one in some]) for name in cls._fields))
+        return cls(
+            np.array([one.base for one in some]),
+            np.array([one.b for one in some]),
+            np.array([one.square for one in some]),
+        )
 
     def singles(self, own: LawSums) -> tuple[np.ndarray, np.ndarray]:
         """ln evidence without a law, and of every law alone: (combination,), (combination, column).

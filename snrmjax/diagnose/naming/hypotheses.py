@@ -34,7 +34,7 @@ from snrmjax.identify.test_model.priors import LEVELS
 _ROUNDS = 3  # of refined shapes and of strengths
 _COARSE = 40.0  # nats that a coarse shape may be below the best
 _REACH = 16.0  # nats below the best within which a column is kept while shapes are refined
-_RIVAL = 25.0  # nats that a law's describing function may make it less probable than it is
+_RIVAL = 25.0  # nats by which an inexact describing function may lower a law's evidence
 _TRIED = 3  # columns of a kind that are made exact for their strengths
 _COUNTS = 0.02  # probability from which on a shape is refined
 _EXTENDED = 4  # sets of laws that are extended by one more
@@ -190,7 +190,7 @@ def hypotheses_of(problem: Problem) -> list[Cell]:
 
 
 def with_rivals(problem: Problem, cells: list[Cell]) -> list[Cell]:
-    """The hypotheses, after the first every further kind alone that might be as probable."""
+    """The first hypothesis, kinds alone that exact changes may make as probable, and the rest."""
     alone = _best_of_kinds(problem, _compared(problem, 2)[1])
     least = cells[0].log_evidence - _RIVAL
     return [cells[0], *(one for one in alone if one.log_evidence > least), *cells[1:]]
